@@ -1,0 +1,67 @@
+"""The Gaussian scene as a value: what reconstructors produce and rasterisers, metrics and exporters read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+SH_DC = 0.28209479177387814  # value of the constant real spherical harmonic
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gaussians:
+    """K Gaussians, activated values ready to rasterise (no logits, no log-scales), in the world frame, scene units.
+
+    ``sh`` holds real spherical harmonics, band 0 first: colour = 0.5 + SH(direction), RGB.
+    ``source_view`` is the index of the view whose pixel made the Gaussian, ``generated`` whether that view was a generated one.
+    """
+
+    means: Float[Tensor, "gaussian 3"]
+    quat_wxyz: Float[Tensor, "gaussian 4"]  # world_from_gaussian; any non-zero length, rasterisers normalise
+    scales: Float[Tensor, "gaussian 3"]  # standard deviations, > 0
+    opacities: Float[Tensor, "gaussian"]  # in [0, 1]
+    sh: Float[Tensor, "gaussian coefficient 3"]
+    source_view: Int[Tensor, "gaussian"]
+    generated: Bool[Tensor, "gaussian"]
+
+    def __post_init__(self) -> None:
+        count = self.means.shape[0]
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value.shape[0] != count:
+                raise ValueError(f"Gaussians.{field.name} has {value.shape[0]} rows, means have {count}")
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    def select(self, keep: Tensor) -> Gaussians:
+        """The Gaussians at a boolean mask or index tensor."""
+        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def detach(self) -> Gaussians:
+        """The same values outside the autograd graph."""
+        return replace(self, **{f.name: getattr(self, f.name).detach() for f in fields(self)})
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The same Gaussians on another device."""
+        return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+def concatenate(parts: list[Gaussians]) -> Gaussians:
+    """All Gaussians of the parts, in order."""
+    if not parts:
+        raise ValueError("concatenate needs at least one set of Gaussians")
+    return Gaussians(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)})
+
+
+def sh_from_rgb(rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Band-0 coefficient whose colour is ``rgb`` in every direction."""
+    return (rgb - 0.5) / SH_DC
+
+
+def rgb_from_sh(sh_dc: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Colour of a band-0 coefficient (not clamped)."""
+    return sh_dc * SH_DC + 0.5

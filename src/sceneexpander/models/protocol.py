@@ -1,0 +1,80 @@
+"""What every reconstructor is: images (+ optional priors) -> one typed prediction in one gauge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.priors import Priors
+
+
+class Head(StrEnum):
+    """The outputs a caller can ask for; a reconstructor runs no head that nobody asked for."""
+
+    CAMERA = "camera"
+    DEPTH = "depth"
+    NORMALS = "normals"
+    POINTS = "points"
+    GAUSSIANS = "gaussians"
+
+
+ALL_HEADS = frozenset(Head)
+GEOMETRY_HEADS = frozenset({Head.CAMERA, Head.DEPTH, Head.NORMALS})  # all that the paper's losses read
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """Outputs of a reconstructor for S views of H x W pixels, all in one world frame and one scale.
+
+    The world frame is approximately the first view's camera frame. Fields of heads that were not asked for are None.
+    """
+
+    camera_vector: Float[Tensor, "view 9"]  # cam_from_world t, quat xyzw, vertical fov, horizontal fov (rad)
+    world_from_cam: Float[Tensor, "view 4 4"]
+    intrinsics_px: Float[Tensor, "view 3 3"]
+    depth: Float[Tensor, "view height width"] | None = None  # z-depth, > 0
+    depth_conf: Float[Tensor, "view height width"] | None = None  # > 1, larger is surer
+    normals: Float[Tensor, "view height width 3"] | None = None  # camera frame, unit, facing the camera
+    normals_conf: Float[Tensor, "view height width"] | None = None
+    points: Float[Tensor, "view height width 3"] | None = None  # world frame
+    points_conf: Float[Tensor, "view height width"] | None = None
+    gaussian_depth: Float[Tensor, "view height width"] | None = None  # depth that placed the Gaussians
+    gaussians: Gaussians | None = None  # after the model's own merge
+
+
+@runtime_checkable
+class Reconstructor(Protocol):
+    """A feed-forward reconstructor. Also an ``nn.Module`` (parameters, state_dict); numerics do not depend on train()/eval()."""
+
+    name: str  # as tables print it
+    size_multiple: int  # H and W must be multiples of this
+
+    def predict(
+        self,
+        images: Float[Tensor, "view 3 height width"],
+        priors: Priors | None = None,
+        *,
+        heads: frozenset[Head] = ALL_HEADS,
+        generated: Bool[Tensor, "view"] | None = None,
+    ) -> Prediction:
+        """Reconstruct S views. RGB in [0, 1]. Differentiable in the parameters.
+
+        Args:
+            images: the views; the first one defines the world frame.
+            priors: see `Priors`. A model that needs priors it does not get raises `ValueError`.
+            heads: outputs to compute.
+            generated: which views are generated, copied onto the Gaussians as provenance (default: none).
+        """
+        ...
+
+
+def as_module(model: Reconstructor) -> nn.Module:
+    """The same object, seen as the module it is."""
+    if not isinstance(model, nn.Module):
+        raise TypeError(f"{type(model).__name__} is not an nn.Module")
+    return model
