@@ -107,7 +107,7 @@ def unproject_to_world(
     """World-frame points of a z-depth map, at pixel centres."""
     points_cam = unproject_depth(depth, intrinsics_px)
     flat = points_cam.flatten(-3, -2)
-    return transform_points(world_from_cam, flat).unflatten(-2, points_cam.shape[-3:-1])
+    return transform_points(world_from_cam, flat).reshape(points_cam.shape)
 
 
 def project_points(

@@ -1,0 +1,58 @@
+"""What the frozen model says about the captured views: the targets of anchor distillation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.artifacts.store import load_artifact, require_tensor, save_artifact
+
+SCHEMA = "anchors/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anchors:
+    """Eq. (anchor_ref): predictions of the frozen model for all n captured views together, without augmentation.
+
+    World frame and scale are those of that one prediction; ``gauge_view`` (always 0) is the view that defines the frame.
+    """
+
+    weights_sha256: str
+    view_ids: tuple[str, ...]
+    camera_vector: Float[Tensor, "view 9"]
+    depth: Float[Tensor, "view height width"]
+    depth_conf: Float[Tensor, "view height width"]
+    normals: Float[Tensor, "view height width 3"]
+    normals_conf: Float[Tensor, "view height width"]
+    gauge_view: int = 0
+
+    def __post_init__(self) -> None:
+        for name in _TENSORS:
+            value = getattr(self, name)
+            if value.shape[0] != len(self.view_ids):
+                raise ValueError(f"Anchors.{name} has {value.shape[0]} views, expected {len(self.view_ids)}")
+            if not torch.isfinite(value).all():
+                raise ValueError(f"Anchors.{name} holds non-finite values")
+
+    def save(self, folder: Path) -> None:
+        """Write into a (scratch) folder."""
+        facts = {"weights_sha256": self.weights_sha256, "view_ids": self.view_ids, "gauge_view": self.gauge_view}
+        save_artifact(folder, SCHEMA, facts, {name: getattr(self, name) for name in _TENSORS})
+
+    @classmethod
+    def load(cls, folder: Path) -> Anchors:
+        """Read what `save` wrote."""
+        facts, tensors = load_artifact(folder, SCHEMA)
+        return cls(
+            weights_sha256=facts["weights_sha256"],
+            view_ids=tuple(facts["view_ids"]),
+            gauge_view=facts["gauge_view"],
+            **{name: require_tensor(tensors, name, folder) for name in _TENSORS},
+        )
+
+
+_TENSORS = tuple(f.name for f in fields(Anchors) if f.name not in {"weights_sha256", "view_ids", "gauge_view"})

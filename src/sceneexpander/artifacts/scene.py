@@ -1,0 +1,87 @@
+"""The prepared scene: captured views and what is to be added, round by round."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.artifacts.store import ArtifactError, load_artifact, save_artifact
+from sceneexpander.artifacts.views import ViewSet
+
+SCHEMA = "scene/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoundSpec:
+    """One sentence of the user. ``motion`` and ``new_object`` are the two fields of the paper's prompt template.
+
+    ``inserted`` is the path, relative to the scene folder, of a recorded or user-given picture, if there is one.
+    """
+
+    prompt: str
+    motion: str = ""
+    new_object: str = ""
+    inserted: str | None = None
+    inserted_sha256: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownCameras:
+    """Cameras that came with the photos (all views), in the first view's frame, intrinsics of the stored images."""
+
+    world_from_cam: Float[Tensor, "view 4 4"] | None
+    intrinsics_px: Float[Tensor, "view 3 3"] | None
+    metric: bool = False  # True only if translations are known to be metres
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """Made by ``prepare``; read by every later stage."""
+
+    name: str
+    views: ViewSet
+    rounds: tuple[RoundSpec, ...]
+    known: KnownCameras | None = None
+
+    def round_spec(self, number: int) -> RoundSpec:
+        """The sentence of round ``number`` (from 1). Raises `ArtifactError` if the scene does not define it."""
+        if not 1 <= number <= len(self.rounds):
+            raise ArtifactError(
+                f"round {number} was asked for, the scene defines {len(self.rounds)}",
+                where=f"scene {self.name!r}",
+                fix="add a prompt for it to the scene's scene.yaml, or take the round out of params.yaml",
+            )
+        return self.rounds[number - 1]
+
+    def save(self, folder: Path) -> None:
+        """Write into a (scratch) folder."""
+        self.views.save(folder / "views")
+        tensors: dict[str, Tensor] = {}
+        if self.known is not None:
+            for key in ("world_from_cam", "intrinsics_px"):
+                value = getattr(self.known, key)
+                if value is not None:
+                    tensors[f"known.{key}"] = value
+        facts = {"name": self.name, "rounds": self.rounds, "metric": self.known is not None and self.known.metric}
+        save_artifact(folder, SCHEMA, facts, tensors)
+
+    @classmethod
+    def load(cls, folder: Path) -> Scene:
+        """Read what `save` wrote."""
+        facts, tensors = load_artifact(folder, SCHEMA)
+        known = None
+        if tensors:
+            known = KnownCameras(
+                world_from_cam=tensors.get("known.world_from_cam"),
+                intrinsics_px=tensors.get("known.intrinsics_px"),
+                metric=bool(facts["metric"]),
+            )
+        return cls(
+            name=facts["name"],
+            views=ViewSet.load(folder / "views"),
+            rounds=tuple(RoundSpec(**item) for item in facts["rounds"]),
+            known=known,
+        )

@@ -1,0 +1,103 @@
+"""The state between rounds: the views so far, what geometry knows of them, and the weights that go with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sceneexpander.artifacts.store import ArtifactError, load_artifact, save_artifact, sha256_of_tensors
+from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.geometry.priors import Priors
+
+PRIORS_SCHEMA = "priors/1"
+WEIGHTS_SCHEMA = "weights-change/1"
+
+
+def save_priors(folder: Path, priors: Priors) -> None:
+    """Write priors into a (scratch) folder."""
+    values = {f.name: getattr(priors, f.name) for f in fields(Priors)}
+    save_artifact(folder, PRIORS_SCHEMA, {}, {name: value for name, value in values.items() if value is not None})
+
+
+def load_priors(folder: Path) -> Priors:
+    """Read what `save_priors` wrote."""
+    _, tensors = load_artifact(folder, PRIORS_SCHEMA)
+    return Priors(**tensors)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeightsChange:
+    """theta - theta_0 against a base that is named by its hash. An empty change is the base itself, bit for bit.
+
+    Tensors that did not change are left out. The adapted weights are *defined* as base + change, so that every reader gets the
+    same bits.
+    """
+
+    base_sha256: str
+    change: dict[str, Tensor]
+
+    @classmethod
+    def between(cls, base: dict[str, Tensor], adapted: dict[str, Tensor]) -> WeightsChange:
+        """The change from ``base`` to ``adapted`` (the same names and shapes)."""
+        if base.keys() != adapted.keys():
+            raise ValueError(f"weights differ in names: {sorted(base.keys() ^ adapted.keys())[:5]}")
+        change = {
+            name: (adapted[name].detach().cpu() - base[name].detach().cpu())
+            for name in base
+            if not torch.equal(base[name].detach().cpu(), adapted[name].detach().cpu())
+        }
+        return cls(base_sha256=sha256_of_tensors(base), change=change)
+
+    def applied_to(self, base: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The adapted weights. Raises `ArtifactError` if ``base`` is not the base that the change was made against."""
+        found = sha256_of_tensors(base)
+        if found != self.base_sha256:
+            raise ArtifactError(
+                f"the change belongs to base weights {self.base_sha256[:12]}, the loaded ones are {found[:12]}",
+                where="adapted weights",
+                fix="use the model and weights that the change was made with, or rerun the stage",
+            )
+        unknown = self.change.keys() - base.keys()
+        if unknown:
+            raise ArtifactError(f"changes unknown tensors {sorted(unknown)[:3]}", where="adapted weights")
+        return {
+            name: value + self.change[name].to(value.device) if name in self.change else value
+            for name, value in base.items()
+        }
+
+    def save(self, folder: Path) -> None:
+        """Write into a (scratch) folder."""
+        save_artifact(folder, WEIGHTS_SCHEMA, {"base_sha256": self.base_sha256}, self.change)
+
+    @classmethod
+    def load(cls, folder: Path) -> WeightsChange:
+        """Read what `save` wrote."""
+        facts, tensors = load_artifact(folder, WEIGHTS_SCHEMA)
+        return cls(base_sha256=facts["base_sha256"], change=tensors)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExpansionState:
+    """Where a round starts: round 0 holds the captured views, round k also the views inserted in rounds 1..k."""
+
+    views: ViewSet
+    priors: Priors
+    weights: WeightsChange
+
+    def save(self, folder: Path) -> None:
+        """Write into a (scratch) folder."""
+        self.views.save(folder / "views")
+        save_priors(folder / "priors", self.priors)
+        self.weights.save(folder / "weights")
+
+    @classmethod
+    def load(cls, folder: Path) -> ExpansionState:
+        """Read what `save` wrote."""
+        return cls(
+            views=ViewSet.load(folder / "views"),
+            priors=load_priors(folder / "priors"),
+            weights=WeightsChange.load(folder / "weights"),
+        )

@@ -1,0 +1,172 @@
+"""How artefacts reach the disk: whole or not at all.
+
+A directory artefact is written under a scratch name beside its target, synced, and renamed; a reader therefore never sees half of one.
+``artifact.json`` (small facts and the schema name) is the last file written into it and its presence marks the artefact.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from sceneexpander.errors import UserError
+
+FACTS_NAME = "artifact.json"
+TENSORS_NAME = "tensors.safetensors"
+
+
+class ArtifactError(UserError):
+    """An artefact on disk is missing, damaged, or of another kind or schema version."""
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_bytes_atomic(path: Path, data: bytes) -> None:
+    """Write a file so that readers see either the old bytes or all of the new ones."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        with scratch.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def write_json_atomic(path: Path, content: object) -> None:
+    """Write JSON (sorted keys, finite numbers only) atomically."""
+    text = json.dumps(to_plain(content), indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
+    write_bytes_atomic(path, (text + "\n").encode())
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file. Raises `ArtifactError` naming the file if it is missing or malformed."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ArtifactError("does not exist", where=path, fix="run the stage that makes it") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ArtifactError(f"is not valid JSON ({error})", where=path, fix="delete it and rerun its stage") from None
+
+
+def to_plain(value: object) -> Any:
+    """Dataclasses, enums, tuples and paths as JSON-ready values."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        items = sorted(value) if isinstance(value, (set, frozenset)) else value
+        return [to_plain(item) for item in items]
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+@contextlib.contextmanager
+def directory_being_written(target: Path) -> Iterator[Path]:
+    """Yield a scratch directory that becomes ``target`` (replacing it) only if the block ends without an error."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    scratch.mkdir()
+    try:
+        yield scratch
+        for path in sorted(scratch.rglob("*")):
+            _sync(path)
+        _sync(scratch)
+        if target.exists():
+            old = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.old")
+            target.rename(old)
+            scratch.rename(target)
+            shutil.rmtree(old)
+        else:
+            scratch.rename(target)
+        _sync(target.parent)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def save_artifact(folder: Path, schema: str, facts: Mapping[str, object], tensors: Mapping[str, Tensor]) -> None:
+    """Fill an existing (scratch) folder with tensors and, last, the facts."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if tensors:
+        # A view into a larger storage would be written whole: contiguous copies only.
+        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(folder / TENSORS_NAME))
+    write_json_atomic(folder / FACTS_NAME, {**to_plain(facts), "schema": schema})
+
+
+def load_artifact(folder: Path, schema: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """(facts, tensors) of a folder written by `save_artifact`, refusing other schemas."""
+    facts = read_json(folder / FACTS_NAME)
+    if not isinstance(facts, dict) or facts.get("schema") != schema:
+        found = facts.get("schema") if isinstance(facts, dict) else type(facts).__name__
+        raise ArtifactError(f"holds {found!r}, expected {schema!r}", where=folder, fix="rerun the stage that makes it")
+    path = folder / TENSORS_NAME
+    if not path.exists():
+        return facts, {}
+    try:
+        return facts, load_file(str(path))
+    except (SafetensorError, OSError) as error:
+        raise ArtifactError(
+            f"cannot be read ({error})", where=path, fix="delete the folder and rerun its stage"
+        ) from None
+
+
+def require_tensor(tensors: Mapping[str, Tensor], name: str, folder: Path) -> Tensor:
+    """The named tensor, or an `ArtifactError` naming what is missing."""
+    if name not in tensors:
+        raise ArtifactError(f"tensor {name!r} is missing", where=folder / TENSORS_NAME, fix="rerun its stage")
+    return tensors[name]
+
+
+def sha256_of_bytes(data: bytes) -> str:
+    """Hex digest."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_of_file(path: Path) -> str:
+    """Hex digest of a file, read in blocks."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def sha256_of_tensors(tensors: Mapping[str, Tensor]) -> str:
+    """Hex digest of names, shapes, dtypes and values, independent of the mapping's order."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name}:{tuple(tensor.shape)}:{tensor.dtype}".encode())
+        digest.update(tensor.flatten().view(dtype=_byte_dtype()).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _byte_dtype() -> Any:
+    import torch
+
+    return torch.uint8

@@ -1,0 +1,151 @@
+"""Views as stored: pictures of one common size, and where each came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image
+from torch import Tensor
+
+from sceneexpander.artifacts.store import ArtifactError, load_artifact, save_artifact
+
+SCHEMA = "views/1"
+Affine = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewRecord:
+    """Where a view came from. ``stored_from_original`` maps original to stored pixel coordinates (corner origin, 2x3)."""
+
+    view_id: str  # unique within the scene and safe as a file name, e.g. "000_DSC_0286"
+    name: str  # the original file name
+    original_height: int
+    original_width: int
+    sha256: str  # of the original bytes
+    stored_from_original: Affine
+    generated: bool = False
+    round: int = 0  # 0: captured; k: inserted in round k
+
+    def original_from_stored(self) -> Affine:
+        """The inverse map, from stored to original pixel coordinates."""
+        matrix = np.vstack([np.asarray(self.stored_from_original, dtype=np.float64), [0.0, 0.0, 1.0]])
+        inverse = np.linalg.inv(matrix)
+        return (
+            (float(inverse[0, 0]), float(inverse[0, 1]), float(inverse[0, 2])),
+            (float(inverse[1, 0]), float(inverse[1, 1]), float(inverse[1, 2])),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewSet:
+    """S views of one size. ``detail_images`` show the same framing at a higher resolution, for feature matching."""
+
+    records: tuple[ViewRecord, ...]
+    images: Float[Tensor, "view 3 height width"]  # RGB in [0, 1]
+    detail_images: Float[Tensor, "view 3 detail_height detail_width"]
+
+    def __post_init__(self) -> None:
+        ids = [record.view_id for record in self.records]
+        if len(set(ids)) != len(ids):
+            raise ValueError(f"view ids are not unique: {ids}")
+        if not len(ids) == self.images.shape[0] == self.detail_images.shape[0]:
+            raise ValueError(
+                f"{len(ids)} records, {self.images.shape[0]} images, {self.detail_images.shape[0]} detail images"
+            )
+        if self.images.ndim != 4 or self.images.shape[1] != 3:
+            raise ValueError(f"images have shape {tuple(self.images.shape)}, expected (view, 3, height, width)")
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    @property
+    def height(self) -> int:
+        """Rows of the stored images."""
+        return int(self.images.shape[-2])
+
+    @property
+    def width(self) -> int:
+        """Columns of the stored images."""
+        return int(self.images.shape[-1])
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids in order."""
+        return tuple(record.view_id for record in self.records)
+
+    @property
+    def generated(self) -> Bool[Tensor, view]:
+        """Which views were generated."""
+        return torch.tensor([record.generated for record in self.records], dtype=torch.bool)
+
+    def select(self, indices: Sequence[int]) -> ViewSet:
+        """The views at the given indices, in that order."""
+        picked = list(indices)
+        return ViewSet(
+            records=tuple(self.records[i] for i in picked),
+            images=self.images[picked],
+            detail_images=self.detail_images[picked],
+        )
+
+    def append(self, other: ViewSet) -> ViewSet:
+        """These views followed by the other ones, which must have the same sizes."""
+        if other.images.shape[1:] != self.images.shape[1:]:
+            raise ValueError(f"views of {tuple(other.images.shape[1:])} cannot join {tuple(self.images.shape[1:])}")
+        return ViewSet(
+            records=self.records + other.records,
+            images=torch.cat([self.images, other.images]),
+            detail_images=torch.cat([self.detail_images, other.detail_images]),
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write into an existing or new (scratch) folder: lossless pictures and the records."""
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        (folder / "detail").mkdir(exist_ok=True)
+        for record, image, detail in zip(self.records, self.images, self.detail_images, strict=True):
+            save_png(folder / "images" / f"{record.view_id}.png", image)
+            save_png(folder / "detail" / f"{record.view_id}.png", detail)
+        save_artifact(folder, SCHEMA, {"records": self.records}, {})
+
+    @classmethod
+    def load(cls, folder: Path) -> ViewSet:
+        """Read what `save` wrote. Raises `ArtifactError` if a picture or record is missing or damaged."""
+        facts, _ = load_artifact(folder, SCHEMA)
+        records = tuple(_record_from_plain(item) for item in facts["records"])
+        if not records:
+            raise ArtifactError("holds no views", where=folder, fix="rerun the stage that makes it")
+        images = torch.stack([load_png(folder / "images" / f"{r.view_id}.png") for r in records])
+        detail = torch.stack([load_png(folder / "detail" / f"{r.view_id}.png") for r in records])
+        return cls(records=records, images=images, detail_images=detail)
+
+
+def _record_from_plain(item: dict[str, Any]) -> ViewRecord:
+    rows = item["stored_from_original"]
+    affine: Affine = ((rows[0][0], rows[0][1], rows[0][2]), (rows[1][0], rows[1][1], rows[1][2]))
+    return replace(ViewRecord(**item), stored_from_original=affine)
+
+
+def to_uint8(image: Float[Tensor, "3 height width"]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """(H, W, 3) bytes of an RGB image in [0, 1], rounded to nearest."""
+    clipped = image.detach().cpu().clamp(0, 1).permute(1, 2, 0)
+    return (clipped * 255 + 0.5).to(torch.uint8).numpy()
+
+
+def save_png(path: Path, image: Float[Tensor, "3 height width"]) -> None:
+    """Write an RGB image in [0, 1] as an 8-bit PNG."""
+    Image.fromarray(to_uint8(image)).save(path, format="PNG", compress_level=3)
+
+
+def load_png(path: Path) -> Float[Tensor, "3 height width"]:
+    """Read an 8-bit picture that `save_png` wrote as RGB in [0, 1]."""
+    try:
+        with Image.open(path) as picture:
+            array = np.asarray(picture.convert("RGB"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise ArtifactError(f"cannot be read ({error})", where=path, fix="rerun the stage that makes it") from None
+    return torch.from_numpy(array.copy()).permute(2, 0, 1).to(torch.float32) / 255
