@@ -1,0 +1,139 @@
+"""Geometry-perturbation augmentation: identity, global affine, blockwise affine with feathered seams, global then block.
+
+A warp is a sampling grid: for every output pixel, where in the input it looks (normalised coordinates of ``grid_sample`` with
+``align_corners=False``, i.e. -1 and 1 are the outer edges of the image).
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.adaptation.config import AugmentConfig
+
+
+class Mode(StrEnum):
+    """The four variants of the paper."""
+
+    IDENTITY = "identity"
+    GLOBAL = "global"
+    BLOCK = "block"
+    GLOBAL_AND_BLOCK = "global_and_block"
+
+
+def draw_mode(config: AugmentConfig, generator: torch.Generator) -> Mode:
+    """One of the four modes with the configured probabilities."""
+    edges = torch.tensor([config.identity, config.global_affine, config.blockwise], dtype=torch.float64).cumsum(0)
+    place = int((torch.rand((), generator=generator, dtype=torch.float64) >= edges).sum())
+    return (Mode.IDENTITY, Mode.GLOBAL, Mode.BLOCK, Mode.GLOBAL_AND_BLOCK)[place]
+
+
+def _uniform(count: int, limit: float, generator: torch.Generator) -> Float[Tensor, count]:
+    return (torch.rand(count, generator=generator) * 2 - 1) * limit
+
+
+def random_affine(
+    config: AugmentConfig, count: int, strength: float, aspect: float, generator: torch.Generator
+) -> Float[Tensor, "count 2 3"]:
+    """Affine maps in units of half the image height (so a rotation is one for any aspect ratio), input from output.
+
+    Args:
+        aspect: width / height.
+    """
+    angle = _uniform(count, math.radians(config.rotation_deg) * strength, generator)
+    scale = torch.exp(_uniform(count, config.scale * strength, generator))
+    shear = torch.tan(_uniform(count, math.radians(config.shear_deg) * strength, generator))
+    shift_x = _uniform(count, 2 * config.translation * strength * aspect, generator)
+    shift_y = _uniform(count, 2 * config.translation * strength, generator)
+    cos, sin = torch.cos(angle) * scale, torch.sin(angle) * scale
+    row_x = torch.stack([cos, cos * shear - sin, shift_x], -1)
+    row_y = torch.stack([sin, sin * shear + cos, shift_y], -1)
+    return torch.stack([row_x, row_y], -2)
+
+
+def identity_grid(height: int, width: int) -> Float[Tensor, "height width 2"]:
+    """The grid that samples every pixel at its own centre."""
+    y = (torch.arange(height) + 0.5) / height * 2 - 1
+    x = (torch.arange(width) + 0.5) / width * 2 - 1
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+
+
+def _apply_affine(
+    affine: Float[Tensor, "2 3"], grid: Float[Tensor, "height width 2"], centre: Float[Tensor, 2], aspect: float
+) -> Float[Tensor, "height width 2"]:
+    """Move grid points by an affine map about ``centre`` (normalised); the map acts in isotropic units."""
+    unit = torch.tensor([aspect, 1.0])
+    local = (grid - centre) * unit
+    moved = local @ affine[:, :2].T + affine[:, 2]
+    return moved / unit + centre
+
+
+def _block_weights(length: int, blocks: int, feather: float) -> Float[Tensor, "blocks length"]:
+    """Weights of each block along one axis: a partition of unity with smooth (raised-cosine) seams."""
+    position = (torch.arange(length) + 0.5) / length * blocks
+    width = max(feather, 1e-6)
+    # Each inner seam is a smooth step centred on the border between two blocks.
+    steps = [torch.ones(length)]
+    for border in range(1, blocks):
+        t = ((position - border) / (2 * width) + 0.5).clamp(0, 1)
+        steps.append(t * t * (3 - 2 * t))
+    steps.append(torch.zeros(length))
+    return torch.stack([steps[i] - steps[i + 1] for i in range(blocks)])
+
+
+def warp_grid(
+    mode: Mode, config: AugmentConfig, height: int, width: int, generator: torch.Generator
+) -> Float[Tensor, "height width 2"]:
+    """Sampling grid of one randomly drawn warp of the given mode."""
+    aspect = width / height
+    grid = identity_grid(height, width)
+    centre = torch.zeros(2)
+    if mode in (Mode.GLOBAL, Mode.GLOBAL_AND_BLOCK):
+        affine = random_affine(config, 1, 1.0, aspect, generator)[0]
+        grid = _apply_affine(affine, grid, centre, aspect)
+    if mode in (Mode.BLOCK, Mode.GLOBAL_AND_BLOCK):
+        grid = _block_warp(grid, config, height, width, generator)
+    return grid
+
+
+def _block_warp(
+    grid: Float[Tensor, "height width 2"], config: AugmentConfig, height: int, width: int, generator: torch.Generator
+) -> Float[Tensor, "height width 2"]:
+    """Move each block of the output by its own affine map about its centre; displacements are blended across the seams."""
+    count = config.grid
+    aspect = width / height
+    affines = random_affine(config, count * count, config.block_strength, aspect, generator)
+    rows = _block_weights(height, count, config.feather)
+    columns = _block_weights(width, count, config.feather)
+    offset = torch.zeros_like(grid)
+    for r in range(count):
+        for c in range(count):
+            centre = torch.tensor([(2 * c + 1) / count - 1, (2 * r + 1) / count - 1])
+            moved = _apply_affine(affines[r * count + c], grid, centre, aspect)
+            offset += (rows[r][:, None] * columns[c])[..., None] * (moved - grid)
+    return grid + offset
+
+
+def sample(
+    maps: Float[Tensor, "channel height width"], grid: Float[Tensor, "height width 2"]
+) -> Float[Tensor, "channel height width"]:
+    """Bilinear sampling of maps at a grid; outside the image the border is repeated."""
+    sampled = torch.nn.functional.grid_sample(
+        maps[None], grid[None].to(maps), mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return sampled[0]
+
+
+def augment_view(
+    image: Float[Tensor, "3 height width"], config: AugmentConfig, generator: torch.Generator
+) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width 2"] | None]:
+    """One randomly perturbed view and its sampling grid; (the very same tensor, None) in identity mode."""
+    mode = draw_mode(config, generator)
+    if mode is Mode.IDENTITY:
+        return image, None
+    grid = warp_grid(mode, config, image.shape[-2], image.shape[-1], generator)
+    return sample(image, grid), grid

@@ -1,0 +1,119 @@
+"""Every choice of the adaptation, with the paper's symbol, value and what it leaves open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+
+class DepthDistance(StrEnum):
+    """d_D of Eq. (anchor): the paper names both."""
+
+    L1 = "l1"
+    SCALE_INVARIANT = "scale_invariant"
+
+
+class DriftForm(StrEnum):
+    """L_reg: sum or mean over all adapted weights of (theta - theta_0)^2. They differ by the number of weights."""
+
+    SUM = "sum"
+    MEAN = "mean"
+
+
+class Gauge(StrEnum):
+    """The first view given to the model defines the world frame.
+
+    ``keep_first`` never drops it from a subset. ``realign`` may, and then re-expresses the anchors (frame and scale) in the new
+    first view's frame.
+    """
+
+    KEEP_FIRST = "keep_first"
+    REALIGN = "realign"
+
+
+class SubsetRule(StrEnum):
+    """Which captured views a step sees: ``paper`` draws n-1, n-2 or n-3 of them, ``all`` takes every one."""
+
+    PAPER = "paper"
+    ALL = "all"
+
+
+class Precision(StrEnum):
+    """Precision of forward passes; weights, EMA and optimiser state are always float32."""
+
+    FP32 = "fp32"
+    BF16 = "bf16"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AugmentConfig:
+    """Geometry-perturbation augmentation of captured views. Magnitudes are ours: the paper only says "weak"."""
+
+    identity: float = 0.25  # probabilities of the four modes, per view; they must sum to 1
+    global_affine: float = 0.25
+    blockwise: float = 0.25
+    global_and_block: float = 0.25
+    rotation_deg: float = 3.0  # uniform in +- this
+    translation: float = 0.03  # share of the image size
+    scale: float = 0.03  # log-scale, +- this
+    shear_deg: float = 2.0
+    grid: int = 3  # blocks per side
+    block_strength: float = 0.5  # block magnitudes relative to the global ones
+    feather: float = 1 / 6  # blending width as a share of a block's side
+
+    def __post_init__(self) -> None:
+        total = self.identity + self.global_affine + self.blockwise + self.global_and_block
+        if abs(total - 1) > 1e-6 or min(self.identity, self.global_affine, self.blockwise, self.global_and_block) < 0:
+            raise ValueError(
+                f"adapt.augment: the four mode probabilities must be >= 0 and sum to 1, they sum to {total}"
+            )
+        if self.grid < 1 or not 0 <= self.feather <= 0.5:
+            raise ValueError("adapt.augment: grid must be >= 1 and feather within [0, 0.5]")
+
+    @property
+    def enabled(self) -> bool:
+        """Whether any view is ever changed."""
+        return self.identity < 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdaptConfig:
+    """Algorithm 1. Defaults are the paper's values where it gives them (T, p, lr, alpha, beta, lambda, r)."""
+
+    steps: int = 400  # T
+    learning_rate: float = 1e-5
+    weight_decay: float = 0.01  # AdamW's own default; the paper does not state it
+    insertion_probability: float = 0.5  # p
+    ema_momentum: float = 0.999  # mu
+    restore_interval: int = 10  # K; 0 switches restoration off
+    restore_rate: float = 1e-3  # r
+    lambda_anchor: float = 1.0
+    lambda_gen: float = 5e-2
+    lambda_reg: float = 1e-4
+    alpha_depth: float = 0.2
+    alpha_normal: float = 0.2
+    beta_depth: float = 1.0
+    beta_normal: float = 1.0
+    camera_huber: float = 1.0  # beta of the smooth-L1 camera distance
+    depth_distance: DepthDistance = DepthDistance.L1
+    drift: DriftForm = DriftForm.SUM
+    gauge: Gauge = Gauge.KEEP_FIRST
+    subset: SubsetRule = SubsetRule.PAPER
+    warp_targets: bool = False  # move the anchors of a warped view with its pixels
+    precision: Precision = Precision.FP32
+    checkpoint_every: int = 25  # steps between resume points; 0: none
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+
+    def __post_init__(self) -> None:
+        problems = [
+            (self.steps >= 0, f"steps must be >= 0, is {self.steps}"),
+            (self.learning_rate > 0, f"learning_rate must be > 0, is {self.learning_rate}"),
+            (0 <= self.insertion_probability <= 1, f"insertion_probability is {self.insertion_probability}"),
+            (0 <= self.ema_momentum < 1, f"ema_momentum must be in [0, 1), is {self.ema_momentum}"),
+            (0 <= self.restore_rate <= 1, f"restore_rate must be in [0, 1], is {self.restore_rate}"),
+            (self.restore_interval >= 0, f"restore_interval must be >= 0, is {self.restore_interval}"),
+            (self.camera_huber > 0, f"camera_huber must be > 0, is {self.camera_huber}"),
+        ]
+        for fine, message in problems:
+            if not fine:
+                raise ValueError(f"adapt.{message}")

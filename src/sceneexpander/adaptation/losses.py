@@ -1,0 +1,111 @@
+"""The distances and losses of the paper, each the mirror of its equation.
+
+Reduction policy: mean over pixels and over the entries of a camera vector, **sum** over views (as Eq. anchor writes it).
+All distances return one value per view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.adaptation.config import AdaptConfig, DepthDistance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewGeometry:
+    """(P, D, N) of some views: camera 9-vectors, depth, normals."""
+
+    camera_vector: Float[Tensor, "view 9"]
+    depth: Float[Tensor, "view height width"]
+    normals: Float[Tensor, "view height width 3"]
+
+    def view(self, start: int, stop: int | None = None) -> ViewGeometry:
+        """A slice of the views."""
+        return ViewGeometry(
+            camera_vector=self.camera_vector[start:stop],
+            depth=self.depth[start:stop],
+            normals=self.normals[start:stop],
+        )
+
+    def detach(self) -> ViewGeometry:
+        """The same values as targets, outside the autograd graph."""
+        return ViewGeometry(
+            camera_vector=self.camera_vector.detach(), depth=self.depth.detach(), normals=self.normals.detach()
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LossTerms:
+    """The three summands of Eq. (anchor) or Eq. (gen), already weighted and summed over views."""
+
+    camera: Float[Tensor, ""]
+    depth: Float[Tensor, ""]
+    normal: Float[Tensor, ""]
+
+    @property
+    def total(self) -> Float[Tensor, ""]:
+        """Their sum."""
+        return self.camera + self.depth + self.normal
+
+
+def camera_distance(
+    predicted: Float[Tensor, "view 9"], target: Float[Tensor, "view 9"], huber: float
+) -> Float[Tensor, view]:
+    """d_cam: mean smooth-L1 over the 9 entries, the target's quaternion given the sign that is nearer to the prediction.
+
+    q and -q are the same rotation; without the alignment equal cameras could have a large distance.
+    """
+    quat = target[:, 3:7]
+    sign = torch.where((predicted[:, 3:7].detach() * quat).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    aligned = torch.cat([target[:, :3], quat * sign, target[:, 7:]], dim=-1)
+    return torch.nn.functional.smooth_l1_loss(predicted, aligned, beta=huber, reduction="none").mean(-1)
+
+
+def depth_distance(
+    predicted: Float[Tensor, "view height width"],
+    target: Float[Tensor, "view height width"],
+    kind: DepthDistance,
+) -> Float[Tensor, view]:
+    """d_D: mean absolute difference, in scene units; or the scale-invariant log error (standard deviation of the log ratio)."""
+    if kind is DepthDistance.L1:
+        return (predicted - target).abs().mean((-2, -1))
+    log_ratio = predicted.log() - target.log()
+    variance = log_ratio.square().mean((-2, -1)) - log_ratio.mean((-2, -1)).square()
+    # The square root has no derivative at 0, which is where an unadapted student starts.
+    return (variance.clamp(min=0) + 1e-8).sqrt() - 1e-4
+
+
+def normal_distance(
+    predicted: Float[Tensor, "view height width 3"], target: Float[Tensor, "view height width 3"]
+) -> Float[Tensor, view]:
+    """d_N: mean of 1 - cosine. Inputs are unit vectors."""
+    return (1 - (predicted * target).sum(-1)).mean((-2, -1))
+
+
+def distillation_terms(
+    student: ViewGeometry, target: ViewGeometry, config: AdaptConfig, *, depth_weight: float, normal_weight: float
+) -> LossTerms:
+    """Eq. (anchor) with alpha, Eq. (gen) with beta: the same three distances, summed over the views given."""
+    return LossTerms(
+        camera=camera_distance(student.camera_vector, target.camera_vector, config.camera_huber).sum(),
+        depth=depth_weight * depth_distance(student.depth, target.depth, config.depth_distance).sum(),
+        normal=normal_weight * normal_distance(student.normals, target.normals).sum(),
+    )
+
+
+def anchor_loss(student: ViewGeometry, anchors: ViewGeometry, config: AdaptConfig) -> LossTerms:
+    """Eq. (anchor) over the captured views of the batch; ``anchors`` are constants."""
+    return distillation_terms(
+        student, anchors.detach(), config, depth_weight=config.alpha_depth, normal_weight=config.alpha_normal
+    )
+
+
+def generation_loss(student: ViewGeometry, teacher: ViewGeometry, config: AdaptConfig) -> LossTerms:
+    """Eq. (gen) on the inserted view; the EMA teacher's outputs are constants."""
+    return distillation_terms(
+        student, teacher.detach(), config, depth_weight=config.beta_depth, normal_weight=config.beta_normal
+    )
