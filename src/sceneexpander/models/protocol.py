@@ -53,6 +53,7 @@ class Reconstructor(Protocol):
 
     name: str  # as tables print it
     size_multiple: int  # H and W must be multiples of this
+    requires_priors: bool  # True: poses, intrinsics, depth and evidence of the geometric front-end are needed
 
     def predict(
         self,
