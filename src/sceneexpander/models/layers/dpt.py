@@ -193,9 +193,17 @@ class DptHead(nn.Module):
         return (slice(begin, min(begin + step, count)) for begin in range(0, count, step))
 
     def features(
-        self, levels: Sequence[Tensor], specials: int, grid: tuple[int, int], size: tuple[int, int]
+        self,
+        levels: Sequence[Tensor],
+        specials: int,
+        grid: tuple[int, int],
+        size: tuple[int, int],
+        skips: Sequence[Tensor | None] | None = None,
     ) -> Float[Tensor, "batch half_features height width"]:
-        """The decoder's last feature map at image size, positions included (Z of the specification)."""
+        """The decoder's last feature map at image size, positions included (Z of the specification).
+
+        ``skips``: maps of the fusion width to add to the levels before they are fused, finest first (None: nothing to add).
+        """
         aspect = size[1] / size[0]
         maps = []
         for j, tokens in enumerate(levels):
@@ -204,7 +212,9 @@ class DptHead(nn.Module):
             if self.config.uv_embedding:
                 projected = add_uv_embedding(projected, aspect)
             resized = self.resize_layers[j](projected)
-            maps.append(self.scratch.get_submodule(f"layer{j + 1}_rn")(resized))
+            level = self.scratch.get_submodule(f"layer{j + 1}_rn")(resized)
+            skip = None if skips is None else skips[j]
+            maps.append(level if skip is None else level + skip)
         out = resize_aligned(self.scratch.get_submodule("output_conv1")(self._fuse(maps)), size)
         return add_uv_embedding(out, aspect) if self.config.uv_embedding else out
 
