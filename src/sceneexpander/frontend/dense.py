@@ -1,0 +1,334 @@
+"""Dense depth of posed views by classical multi-view stereo, with a calibrated mask of where to believe it.
+
+Per view: plane sweep over inverse depth (`dense_sweep`), semi-global matching (`sgm`), per-pixel refinement; then a check
+across views (`dense_check`) that yields the confident mask; then planes per colour segment and edge-aware smoothing (`fill`)
+until every pixel has a depth. Views that cannot be matched (no pose, no sparse points, pure rotation, no partner) get the
+interpolation of what is known, and no confident pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sceneexpander.frontend.dense_check import Agreement, check_view, without_small_parts
+from sceneexpander.frontend.dense_sweep import WORST_COST, WindowMatcher, sweep_offsets, sweep_planes
+from sceneexpander.frontend.dense_views import (
+    Image32,
+    WorkView,
+    choose_sources,
+    inverse_depth_range,
+    plane_inverse_depths,
+    prepare_views,
+    visible_depths,
+)
+from sceneexpander.frontend.fill import interpolate_sparse, pixels_to_nearest, segment_planes, smooth_fill
+from sceneexpander.frontend.segments import segment_colours
+from sceneexpander.frontend.sgm import COST_SCALE, aggregate, best_hypothesis
+from sceneexpander.frontend.sparse_points import SparsePoints
+from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
+
+Result = TypeVar("Result")
+
+_FULL_SIZE_PX = 320.0  # long side for which the pixel constants below were tuned
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DenseConfig:
+    """Constants of the dense matcher. Lengths in pixels are at the working resolution."""
+
+    work_px: int = 336  # long side at which matching runs; smaller images are matched as they are
+    threads: int = 2  # reference views worked on at the same time; does not change the result
+    planes: int = 64  # most depth hypotheses of the sweep
+    plane_step_px: float = 0.75  # fewer planes are used where this step in the widest source needs fewer
+    far_factor: float = 0.6  # farthest plane: this over the 98th percentile of sparse depth
+    near_factor: float = 1.5  # nearest plane: this over the 2nd percentile
+    sources: int = 4  # other views matched against each view, at most
+    min_parallax_px: float = 0.25  # sources with less motion per 10 % of depth are not used
+    window: int = 7  # side of the correlation window
+    prior: float = 0.15  # most that a plane pays for contradicting the sparse interpolation
+    prior_range: float = 0.7  # log-depth distance at which it pays that
+    penalty_near: float = 0.04  # semi-global matching: one hypothesis further
+    penalty_jump: float = 0.35  # more than one further, on an even surface
+    jump_contrast: float = 12.0  # lowers the jump penalty across grey-level edges
+    ambiguity_margin: float = 0.6  # aggregated cost within which another plane counts as nearly as good
+    refine_window: int = 5  # window of the refinement, which follows the surface and can be smaller
+    refine_offsets: int = 7  # hypotheses around the first result
+    refine_reach: float = 1.2  # the outermost of them, in planes
+    reprojection_px: float = 1.5  # cross-view check: largest distance after going there and back
+    depth_tolerance: float = 0.04  # and largest relative difference of depth
+    max_cost: float = 0.6  # a confident pixel must match better than this
+    min_part_px: int = 20  # smaller confident islands are dropped (at 320 pixels; scaled by area)
+    segment_tolerances: tuple[float, ...] = (0.35, 1.2)  # colour segments, fine and coarse
+    min_segment_px: int = 40  # smallest segment (at 320 pixels; scaled by area)
+    plane_tolerance: float = 0.05  # relative error at which a sample stops supporting a segment's plane
+    min_plane_support: float = 0.35  # planes with less support are not used
+    plane_weights: tuple[float, ...] = (0.3, 0.12)  # weight of a fully supported plane in the final fill, per scale
+    smooth_reach: float = 0.054  # reach of the final fill as a share of the long side
+    colour_sigma: float = 0.04  # colour step that stops the final fill
+    weight_agreed: float = 1.0  # confident, two or more other views agree
+    weight_confident: float = 0.6  # confident, one other view agrees
+    weight_raw: float = 0.001  # matched but not confident
+    weight_point: float = 2.0  # sparse points
+    weight_interpolation: float = 0.003  # interpolation of the sparse points
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DenseDepth:
+    """Depth everywhere and how far to believe it.
+
+    ``evidence`` holds `sceneexpander.geometry.priors.EVIDENCE_CHANNELS`, in that order. Values of views that could not be
+    matched: agreeing, parallax, plane and gap 0, cost 1.2, ambiguity 1. Pixel lengths are in pixels of the given images.
+    """
+
+    depth: Float[Tensor, "view height width"]  # z-depth in the scale of the poses, > 0 everywhere
+    confident: Bool[Tensor, "view height width"]  # the cross-view check passed
+    evidence: Float[Tensor, "view channel height width"]
+
+
+@dataclass(slots=True)
+class _Matched:
+    """Raw result of matching one view, at the working resolution."""
+
+    inverse_depth: Image32
+    cost: Image32
+    ambiguity: Image32
+
+
+def dense_depth(
+    images: Float[Tensor, "view 3 height width"],
+    world_from_cam: Float[Tensor, "view 4 4"],
+    intrinsics_px: Float[Tensor, "view 3 3"],
+    sparse: SparsePoints,
+    config: DenseConfig,
+    *,
+    posed: Bool[Tensor, "view"] | None = None,
+) -> DenseDepth:
+    """Depth of every pixel of every view, from images, cameras and sparse points in the same world.
+
+    Args:
+        images: RGB in [0, 1].
+        world_from_cam: camera poses; those of views that are not ``posed`` are ignored.
+        intrinsics_px: in pixels of ``images``.
+        sparse: triangulated points; may be empty.
+        posed: False for views whose pose is only a placeholder; all posed by default.
+
+    Raises:
+        ValueError: shapes that do not belong together.
+    """
+    count = images.shape[0]
+    if world_from_cam.shape[0] != count or intrinsics_px.shape[0] != count:
+        raise ValueError(f"{count} images, {world_from_cam.shape[0]} poses and {intrinsics_px.shape[0]} intrinsics")
+    height, width = images.shape[-2:]
+    is_posed = np.ones(count, bool) if posed is None else posed.cpu().numpy().astype(bool)
+    scale = min(1.0, config.work_px / max(height, width))
+    size = (max(2, round(height * scale)), max(2, round(width * scale)))
+    views = prepare_views(images, world_from_cam, intrinsics_px, sparse, is_posed, size=size)
+    limits = [_limits(views, s, config) for s in range(count)]
+    interpolated = [_interpolation(views, s, limits) for s in range(count)]
+
+    def match(s: int) -> _Matched | None:
+        return _match_view(views, s, limits[s], interpolated[s], config)
+
+    matched = _each(match, count, config.threads)
+    depths = [None if m is None else 1 / m.inverse_depth for m in matched]
+
+    def finish(s: int) -> tuple[Image32, NDArray[np.float32]]:
+        agreement = None
+        if depths[s] is not None:
+            agreement = check_view(
+                views,
+                depths,
+                s,
+                reprojection_px=config.reprojection_px,
+                depth_tolerance=config.depth_tolerance,
+            )
+        return _fill_view(views, s, matched[s], agreement, interpolated[s], limits[s], config)
+
+    finished = _each(finish, count, config.threads)
+    return _assemble(finished, (height, width))
+
+
+def _each(work: Callable[[int], Result], count: int, threads: int) -> list[Result]:
+    """``work(0..count-1)`` in order, on up to ``threads`` threads (OpenCV and numpy release the interpreter lock)."""
+    if threads <= 1 or count <= 1:
+        return [work(s) for s in range(count)]
+    with ThreadPoolExecutor(max_workers=min(threads, count)) as pool:
+        return list(pool.map(work, range(count)))
+
+
+def _limits(views: list[WorkView], s: int, config: DenseConfig) -> tuple[float, float]:
+    """(far, near) inverse depth of a view: from its points, else from all points, else from the distance of the cameras."""
+    factors = {"near_factor": config.near_factor, "far_factor": config.far_factor}
+    own = inverse_depth_range(visible_depths(views, s), **factors) if views[s].posed else None
+    if own is not None:
+        return own
+    everything = inverse_depth_range(np.concatenate([view.seen_depth for view in views]), **factors)
+    if everything is not None:
+        return everything
+    centres = np.array([view.world_from_cam[:3, 3] for view in views if view.posed]).reshape(-1, 3)
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) if len(centres) > 1 else 0.0
+    typical = 5 * spread if spread > 0 else 1.0
+    return 0.5 / typical, 2 / typical
+
+
+def _interpolation(views: list[WorkView], s: int, limits: list[tuple[float, float]]) -> Image32:
+    """Log inverse depth interpolated from the view's sparse points; the middle of its range without any."""
+    view = views[s]
+    if not len(view.seen_depth):
+        far, near = limits[s]
+        return np.full(view.grey.shape, 0.5 * (np.log(far) + np.log(near)), np.float32)
+    softness = 0.01 * max(view.grey.shape)
+    return interpolate_sparse(view.seen_xy, -np.log(view.seen_depth), view.grey.shape, softness_px=softness)
+
+
+def _match_view(
+    views: list[WorkView], s: int, limits: tuple[float, float], expected: Image32, config: DenseConfig
+) -> _Matched | None:
+    """Raw depth of one view, or None where there is nothing to match against."""
+    sources = choose_sources(views, s, limit=config.sources, min_parallax_px=config.min_parallax_px)
+    view = views[s]
+    if not sources or min(view.grey.shape) < config.window:
+        return None
+    planes = plane_inverse_depths(view, sources, *limits, most=config.planes, step_px=config.plane_step_px)
+    matcher = WindowMatcher(view, views, sources, config.window)
+    has_points = len(view.seen_depth) > 0
+    volume = sweep_planes(
+        matcher, planes, expected if has_points else None, prior=config.prior, prior_range=config.prior_range
+    )
+    penalties = {
+        "penalty_near": config.penalty_near,
+        "penalty_jump": config.penalty_jump,
+        "contrast": config.jump_contrast,
+    }
+    best = best_hypothesis(aggregate(volume, view.grey, diagonals=True, **penalties), margin=config.ambiguity_margin)
+    step = float(planes[1] - planes[0])
+    first = (planes[0] + step * (best.index + best.offset)).astype(np.float32)
+
+    base = cv2.medianBlur(first, 5)
+    offsets = np.linspace(-config.refine_reach, config.refine_reach, config.refine_offsets) * step
+    matcher = WindowMatcher(view, views, sources, config.refine_window)
+    volume, hypotheses = sweep_offsets(matcher, base, offsets)
+    refined = best_hypothesis(aggregate(volume, view.grey, diagonals=False, **penalties), margin=1.0)
+    at = refined.index[:, None]
+    inverse_depth = np.take_along_axis(hypotheses, at, axis=1)[:, 0]
+    inverse_depth += refined.offset * np.float32(offsets[1] - offsets[0])
+    cost = np.take_along_axis(volume, at, axis=1)[:, 0].astype(np.float32) / COST_SCALE
+    floor = np.float32(0.5 * limits[0])
+    return _Matched(inverse_depth=np.maximum(inverse_depth, floor), cost=cost, ambiguity=best.ambiguity)
+
+
+def _fill_view(
+    views: list[WorkView],
+    s: int,
+    matched: _Matched | None,
+    agreement: Agreement | None,
+    interpolated: Image32,
+    limits: tuple[float, float],
+    config: DenseConfig,
+) -> tuple[Image32, NDArray[np.float32]]:
+    """Final depth (height, width) and evidence (channel, height, width) of one view, at the working resolution."""
+    view = views[s]
+    shape = view.grey.shape
+    area = (max(shape) / _FULL_SIZE_PX) ** 2
+    confident = np.zeros(shape, bool)
+    value = interpolated.copy()
+    weight = np.full(shape, config.weight_interpolation, np.float32)
+    if matched is not None and agreement is not None:
+        confident = (agreement.agreeing >= 1) & (matched.cost < config.max_cost)
+        confident &= agreement.parallax > config.min_parallax_px
+        confident = without_small_parts(confident, max(1, round(config.min_part_px * area)))
+        trust = np.where(agreement.agreeing >= 2, config.weight_agreed, config.weight_confident)
+        trust = np.where(confident, trust, config.weight_raw).astype(np.float32)
+        value, weight = _blend(value, weight, np.log(matched.inverse_depth), trust)
+    known = np.where(confident, weight, 0).astype(np.float32)
+    known_value = value.copy()
+    if len(view.seen_depth):
+        column, row = view.seen_xy[:, 0].astype(int), view.seen_xy[:, 1].astype(int)
+        log_inverse = -np.log(view.seen_depth).astype(np.float32)
+        value[row, column], weight[row, column] = log_inverse, config.weight_point
+        known_value[row, column], known[row, column] = log_inverse, config.weight_point
+    score = np.zeros(shape, np.float32)
+    if known.any():
+        min_size = max(4, round(config.min_segment_px * area))
+        tolerances = tuple(t * area for t in config.segment_tolerances)
+        partitions = segment_colours(view.rgb, tolerances=tolerances, min_size=min_size)
+        for labels, plane_weight in zip(partitions, config.plane_weights, strict=True):
+            plane, support = segment_planes(
+                labels, np.exp(known_value), known, limits, tolerance=config.plane_tolerance, min_samples=12
+            )
+            support = np.where(support > config.min_plane_support, support, 0)
+            value, weight = _blend(value, weight, np.log(plane), plane_weight * support)
+            score = np.maximum(score, support)
+    reach = config.smooth_reach * max(shape)
+    filled = smooth_fill(value, weight, view.rgb, reach_px=reach, colour_sigma=config.colour_sigma)
+    return np.exp(-filled), _evidence(
+        view, matched, agreement, confident=confident, score=score, filled=filled, interpolated=interpolated
+    )
+
+
+def _blend(value: Image32, weight: Image32, other: Image32, other_weight: Image32) -> tuple[Image32, Image32]:
+    """Weighted mean of two estimates and its weight."""
+    total = weight + other_weight
+    return (value * weight + other * other_weight) / total, total.astype(np.float32)
+
+
+def _evidence(
+    view: WorkView,
+    matched: _Matched | None,
+    agreement: Agreement | None,
+    *,
+    confident: NDArray[np.bool_],
+    score: Image32,
+    filled: Image32,
+    interpolated: Image32,
+) -> NDArray[np.float32]:
+    """The channels of `EVIDENCE_CHANNELS`; counts and pixel lengths still in units of the working resolution."""
+    shape = view.grey.shape
+    none = np.zeros(shape, np.float32)
+    channels: dict[str, NDArray[np.float32]] = {
+        "confident": confident.astype(np.float32),
+        "agreeing": none if agreement is None else agreement.agreeing,
+        "cost": np.full(shape, WORST_COST, np.float32) if matched is None else matched.cost,
+        "ambiguity": np.ones(shape, np.float32) if matched is None else matched.ambiguity,
+        "parallax": none if agreement is None else agreement.parallax,
+        "plane": score,
+        "gap": none if matched is None else np.clip(filled - np.log(matched.inverse_depth), -1, 1),
+        "sparse": np.clip(filled - interpolated, -1, 1),
+        "distance": pixels_to_nearest(view.seen_xy, shape),
+    }
+    return np.stack([channels[name] for name in EVIDENCE_CHANNELS])
+
+
+def _assemble(finished: list[tuple[Image32, NDArray[np.float32]]], size: tuple[int, int]) -> DenseDepth:
+    """Results of all views at the size of the given images."""
+    height, width = size
+    count = len(finished)
+    channels = {name: k for k, name in enumerate(EVIDENCE_CHANNELS)}
+    depth = np.empty((count, height, width), np.float32)
+    evidence = np.empty((count, len(channels), height, width), np.float32)
+    for s, (work_depth, work_evidence) in enumerate(finished):
+        pixels = max(size) / max(work_depth.shape)
+        work_evidence[channels["agreeing"]] /= max(count - 1, 1)
+        for name in ("parallax", "distance"):
+            work_evidence[channels[name]] = np.log1p(work_evidence[channels[name]] * np.float32(pixels))
+        if work_depth.shape == size:
+            depth[s], evidence[s] = work_depth, work_evidence
+            continue
+        depth[s] = np.exp(cv2.resize(np.log(work_depth), (width, height), interpolation=cv2.INTER_LINEAR))
+        for k in range(len(channels)):
+            evidence[s, k] = cv2.resize(work_evidence[k], (width, height), interpolation=cv2.INTER_NEAREST)
+    return DenseDepth(
+        depth=torch.from_numpy(depth),
+        confident=torch.from_numpy(evidence[:, channels["confident"]] > 0.5),
+        evidence=torch.from_numpy(evidence),
+    )
