@@ -1,0 +1,141 @@
+"""Per-scene warm-up: a few steps on the captured views alone, so that a small model starts from a theta_0 that fits the scene.
+
+The supervision is photometric: the Gaussians of all views are rendered at a captured camera, once all of them and once without
+those of that view itself, and compared with the photo. A share of 16 x 16 pixel cells is held out; if the held-out error does not
+fall, the old weights are kept. Models with strong weights of their own do not need it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sceneexpander.geometry.priors import Priors
+from sceneexpander.geometry.randomness import child_generator
+from sceneexpander.models.protocol import ALL_HEADS, Prediction, Reconstructor, as_module
+from sceneexpander.splatting import render
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WarmupConfig:
+    """How long and how strongly to fit the captured views before anything is inserted."""
+
+    steps: int = 0  # 0: off
+    learning_rate: float = 2e-4
+    held_out: float = 0.25  # share of the cells that the loss never sees
+    cell_px: int = 16
+    others_weight: float = 1.0  # weight of the rendering without the view's own Gaussians
+    min_alpha: float = 0.5  # pixels of that rendering count where the other views cover them at least this much
+
+    def __post_init__(self) -> None:
+        if self.steps < 0 or not 0 < self.held_out < 1 or self.cell_px < 1:
+            raise ValueError("warmup: steps must be >= 0, held_out within (0, 1), cell_px >= 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WarmupReport:
+    """Held-out error (mean absolute colour difference, weighted like the loss) before and after; accepted or not."""
+
+    steps: int
+    before: float
+    after: float
+    accepted: bool
+
+
+def held_out_cells(
+    views: int, height: int, width: int, config: WarmupConfig, *, seed: int
+) -> Bool[Tensor, "view height width"]:
+    """True where a pixel belongs to a held-out cell."""
+    generator = child_generator(seed, "warmup/cells")
+    rows, columns = -(-height // config.cell_px), -(-width // config.cell_px)
+    cells = torch.rand(views, rows, columns, generator=generator) < config.held_out
+    grown = cells.repeat_interleave(config.cell_px, -2).repeat_interleave(config.cell_px, -1)
+    return grown[:, :height, :width]
+
+
+def photometric_error(
+    prediction: Prediction,
+    images: Float[Tensor, "view 3 height width"],
+    view: int,
+    mask: Bool[Tensor, "height width"],
+    config: WarmupConfig,
+) -> Float[Tensor, ""]:
+    """Mean absolute error of the photo of ``view`` rendered from all Gaussians, plus that from the other views' Gaussians."""
+    gaussians = prediction.gaussians
+    if gaussians is None:
+        raise ValueError("the warm-up needs the Gaussian head")
+    height, width = images.shape[-2:]
+    pose, intrinsics = prediction.world_from_cam[view : view + 1], prediction.intrinsics_px[view : view + 1]
+    whole = render(gaussians, pose, intrinsics, height, width)
+    error = (whole.rgb[0] - images[view]).abs().mean(0)
+    total = _masked_mean(error, mask)
+    if config.others_weight > 0 and images.shape[0] > 1:
+        others = render(gaussians.select(gaussians.source_view != view), pose, intrinsics, height, width)
+        covered = (others.alpha[0].detach() > config.min_alpha) & mask
+        # Colour of what is there, not of the black behind it: the loss is to move geometry, not to fill holes.
+        colour = others.rgb[0] / others.alpha[0].clamp(min=config.min_alpha)
+        total = total + config.others_weight * _masked_mean((colour - images[view]).abs().mean(0), covered)
+    return total
+
+
+def _masked_mean(values: Float[Tensor, "height width"], mask: Bool[Tensor, "height width"]) -> Float[Tensor, ""]:
+    return (values * mask).sum() / mask.sum().clamp(min=1)
+
+
+def warm_up(
+    model: Reconstructor,
+    images: Float[Tensor, "view 3 height width"],
+    priors: Priors | None,
+    config: WarmupConfig,
+    *,
+    seed: int,
+    on_step: Callable[[int, float], None] | None = None,
+) -> WarmupReport | None:
+    """Fit ``model`` to its captured views in place; returns None if the warm-up is off.
+
+    If the held-out error does not fall, the weights are put back bit for bit.
+    """
+    if config.steps == 0:
+        return None
+    module = as_module(model)
+    start = {name: value.detach().clone() for name, value in module.state_dict().items()}
+    views, _, height, width = images.shape
+    hidden = held_out_cells(views, height, width, config, seed=seed).to(images.device)
+    before = _held_out_error(model, images, priors, hidden, config)
+    parameters = [p for p in module.parameters() if p.requires_grad]
+    optimiser = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=0.0, foreach=True)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps, config.learning_rate / 10)
+    order = torch.randperm(views, generator=child_generator(seed, "warmup/order")).tolist()
+    for step in range(config.steps):
+        view = order[step % views]
+        prediction = model.predict(images, priors, heads=ALL_HEADS)
+        loss = photometric_error(prediction, images, view, ~hidden[view], config)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(parameters, 1.0)
+        optimiser.step()
+        schedule.step()
+        if on_step is not None:
+            on_step(step + 1, float(loss.detach()))
+    after = _held_out_error(model, images, priors, hidden, config)
+    accepted = after < before
+    if not accepted:
+        module.load_state_dict(start)
+    return WarmupReport(steps=config.steps, before=before, after=after, accepted=accepted)
+
+
+@torch.no_grad()
+def _held_out_error(
+    model: Reconstructor,
+    images: Float[Tensor, "view 3 height width"],
+    priors: Priors | None,
+    hidden: Bool[Tensor, "view height width"],
+    config: WarmupConfig,
+) -> float:
+    prediction = model.predict(images, priors, heads=ALL_HEADS)
+    errors = [photometric_error(prediction, images, v, hidden[v], config) for v in range(images.shape[0])]
+    return float(torch.stack(errors).mean())

@@ -1,0 +1,22 @@
+"""One round of expansion, put together from the rooms below: state in, state out."""
+
+from sceneexpander.expansion.loaded import LoadedModel, ModelConfig, PriorsUse, load_model
+from sceneexpander.expansion.rounds import (
+    RoundInputs,
+    adapt_round,
+    captured_prediction,
+    initial_state,
+    joint_reconstruction,
+)
+
+__all__ = [
+    "LoadedModel",
+    "ModelConfig",
+    "PriorsUse",
+    "RoundInputs",
+    "adapt_round",
+    "captured_prediction",
+    "initial_state",
+    "joint_reconstruction",
+    "load_model",
+]

@@ -1,0 +1,209 @@
+"""The steps of a round as functions from artefacts to artefacts. No paths, no configuration files, no tracking."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, StepRecord, adapt
+from sceneexpander.adaptation.warmup import WarmupConfig, WarmupReport, warm_up
+from sceneexpander.artifacts.anchors import Anchors
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.scene import KnownCameras, Scene
+from sceneexpander.artifacts.state import ExpansionState, WeightsChange
+from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.expansion.loaded import LoadedModel
+from sceneexpander.frontend.prior import FrontendConfig, build_priors
+from sceneexpander.frontend.sfm import SparseReconstruction
+from sceneexpander.geometry.priors import Priors
+from sceneexpander.geometry.randomness import child_generator
+from sceneexpander.models.protocol import Prediction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoundInputs:
+    """What a round starts from."""
+
+    state: ExpansionState
+    inserted: InsertedView
+    anchors: Anchors
+    joint_priors: Priors
+
+
+def views_priors(
+    views: ViewSet,
+    loaded: LoadedModel,
+    frontend: FrontendConfig,
+    *,
+    seed: int,
+    known: KnownCameras | None = None,
+) -> tuple[Priors, SparseReconstruction | None]:
+    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing."""
+    if not loaded.uses_front_end:
+        return Priors(), None
+    complete = known is not None and known.world_from_cam is not None
+    return build_priors(
+        views.images,
+        frontend,
+        generator=child_generator(seed, "frontend"),
+        feature_images=views.detail_images,
+        known_intrinsics_px=None if known is None else known.intrinsics_px,
+        known_world_from_cam=known.world_from_cam if complete and known is not None else None,
+        names=[record.name for record in views.records],
+    )
+
+
+def initial_state(
+    scene: Scene,
+    loaded: LoadedModel,
+    frontend: FrontendConfig,
+    warmup: WarmupConfig,
+    *,
+    seed: int,
+    on_step: Callable[[int, float], None] | None = None,
+) -> tuple[ExpansionState, Reconstruction, SparseReconstruction | None, WarmupReport | None]:
+    """Round 0: the captured views, their geometry, theta_0 (after the optional warm-up), and what the model makes of them."""
+    priors, sparse = views_priors(scene.views, loaded, frontend, seed=seed, known=scene.known)
+    loaded.reset()
+    report = warm_up(
+        loaded.model,
+        scene.views.images.to(loaded.device),
+        _device_priors(priors, loaded),
+        warmup,
+        seed=seed,
+        on_step=on_step,
+    )
+    weights = WeightsChange.between(loaded.base, loaded.state())
+    state = ExpansionState(views=scene.views, priors=priors, weights=weights)
+    return state, reconstruct(state.views, priors, loaded, weights, method="captured"), sparse, report
+
+
+@torch.no_grad()
+def predict(views: ViewSet, priors: Priors, loaded: LoadedModel, weights: WeightsChange) -> Prediction:
+    """All heads on the views, with the given weights."""
+    loaded.apply(weights)
+    return loaded.model.predict(
+        views.images.to(loaded.device), _device_priors(priors, loaded), generated=views.generated.to(loaded.device)
+    )
+
+
+def reconstruct(
+    views: ViewSet, priors: Priors, loaded: LoadedModel, weights: WeightsChange, *, method: str
+) -> Reconstruction:
+    """A reconstruction artefact of the views."""
+    return _as_reconstruction(predict(views, priors, loaded, weights), views, priors, loaded, weights, method)
+
+
+def captured_prediction(state: ExpansionState, loaded: LoadedModel) -> tuple[Anchors, Reconstruction]:
+    """Eq. (anchor_ref): what the model believed before the insertion; as anchors and as a reconstruction.
+
+    The views of the state are all views so far: from round 2 on, those inserted before are anchored too (and stay marked as generated).
+    """
+    reconstruction = reconstruct(state.views, state.priors, loaded, state.weights, method="captured")
+    anchors = Anchors(
+        weights_sha256=reconstruction.weights_sha256,
+        view_ids=reconstruction.view_ids,
+        camera_vector=reconstruction.camera_vector,
+        depth=reconstruction.depth,
+        depth_conf=reconstruction.depth_conf,
+        normals=reconstruction.normals,
+        normals_conf=reconstruction.normals_conf,
+    )
+    return anchors, reconstruction
+
+
+def joint_reconstruction(
+    state: ExpansionState,
+    inserted: InsertedView,
+    loaded: LoadedModel,
+    frontend: FrontendConfig,
+    *,
+    seed: int,
+) -> tuple[Priors, Reconstruction, SparseReconstruction | None]:
+    """The baseline: the unadapted model given all views, the inserted one last and treated like any other."""
+    views = state.views.append(inserted.view)
+    priors, sparse = views_priors(views, loaded, frontend, seed=seed)
+    return priors, reconstruct(views, priors, loaded, state.weights, method="backbone"), sparse
+
+
+def adapt_round(
+    inputs: RoundInputs,
+    loaded: LoadedModel,
+    config: AdaptConfig,
+    *,
+    seed: int,
+    checkpoint_folder: Path | None = None,
+    on_step: Callable[[StepRecord], None] | None = None,
+) -> tuple[ExpansionState, Reconstruction, AdaptationResult]:
+    """Algorithm 1, then the expanded scene with the adapted weights: the state that the next round starts from."""
+    state = inputs.state
+    loaded.apply(state.weights)
+    result = adapt(
+        loaded.model,
+        AdaptationInputs(
+            captured=state.views.images.to(loaded.device),
+            inserted=inputs.inserted.view.images[0].to(loaded.device),
+            anchors=_device_anchors(inputs.anchors, loaded),
+            captured_priors=_device_priors(state.priors, loaded),
+            joint_priors=_device_priors(inputs.joint_priors, loaded),
+        ),
+        config,
+        seed=seed,
+        checkpoint_folder=checkpoint_folder,
+        on_step=on_step,
+    )
+    # Without a step nothing changed: keep the very change that the round started from, bit for bit.
+    weights = WeightsChange.between(loaded.base, result.student) if config.steps else state.weights
+    views = state.views.append(inputs.inserted.view)
+    expanded = ExpansionState(views=views, priors=inputs.joint_priors, weights=weights)
+    return expanded, reconstruct(views, inputs.joint_priors, loaded, weights, method="sceneexpander"), result
+
+
+def _device_priors(priors: Priors, loaded: LoadedModel) -> Priors | None:
+    return priors.to(loaded.device) if loaded.uses_front_end else None
+
+
+def _device_anchors(anchors: Anchors, loaded: LoadedModel) -> Anchors:
+    def moved(value: Tensor) -> Tensor:
+        return value.to(loaded.device)
+
+    return Anchors(
+        weights_sha256=anchors.weights_sha256,
+        view_ids=anchors.view_ids,
+        camera_vector=moved(anchors.camera_vector),
+        depth=moved(anchors.depth),
+        depth_conf=moved(anchors.depth_conf),
+        normals=moved(anchors.normals),
+        normals_conf=moved(anchors.normals_conf),
+        gauge_view=anchors.gauge_view,
+    )
+
+
+def _as_reconstruction(
+    prediction: Prediction, views: ViewSet, priors: Priors, loaded: LoadedModel, weights: WeightsChange, method: str
+) -> Reconstruction:
+    parts = {
+        name: getattr(prediction, name) for name in ("depth", "depth_conf", "normals", "normals_conf", "gaussians")
+    }
+    missing = [name for name, value in parts.items() if value is None]
+    if missing:
+        raise ValueError(f"{loaded.model.name} gave no {', '.join(missing)}")
+    posed = torch.ones(len(views), dtype=torch.bool) if priors.posed is None else priors.posed
+    return Reconstruction(
+        method=method,
+        model=loaded.model.name,
+        weights_sha256=loaded.fingerprint(weights),
+        view_ids=views.view_ids,
+        generated=views.generated,
+        posed=posed.cpu(),
+        camera_vector=prediction.camera_vector.cpu(),
+        world_from_cam=prediction.world_from_cam.cpu(),
+        intrinsics_px=prediction.intrinsics_px.cpu(),
+        **{name: value.to("cpu") for name, value in parts.items() if value is not None},
+    )

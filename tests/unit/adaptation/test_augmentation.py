@@ -1,0 +1,91 @@
+import pytest
+import torch
+
+from sceneexpander.adaptation.augmentation import (
+    Mode,
+    _block_weights,
+    augment_view,
+    draw_mode,
+    identity_grid,
+    sample,
+    warp_grid,
+)
+from sceneexpander.adaptation.config import AugmentConfig
+
+STILL = AugmentConfig(rotation_deg=0, translation=0, scale=0, shear_deg=0)
+
+
+def _generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_zero_magnitudes_change_nothing(mode: Mode) -> None:
+    grid = warp_grid(mode, STILL, 20, 30, _generator())
+    torch.testing.assert_close(grid, identity_grid(20, 30), atol=1e-6, rtol=0)
+
+
+def test_the_identity_grid_samples_every_pixel_at_its_centre() -> None:
+    image = torch.rand(3, 17, 23, generator=_generator())
+    torch.testing.assert_close(sample(image, identity_grid(17, 23)), image, atol=1e-5, rtol=0)
+
+
+def test_identity_mode_returns_the_very_same_tensor() -> None:
+    image = torch.rand(3, 8, 8)
+    config = AugmentConfig(identity=1, global_affine=0, blockwise=0, global_and_block=0)
+    moved, grid = augment_view(image, config, _generator())
+    assert moved is image
+    assert grid is None
+
+
+def test_modes_come_with_their_probabilities() -> None:
+    config = AugmentConfig(identity=0.1, global_affine=0.2, blockwise=0.3, global_and_block=0.4)
+    generator = _generator(7)
+    draws = [draw_mode(config, generator) for _ in range(4000)]
+    for mode, p in zip(Mode, (0.1, 0.2, 0.3, 0.4), strict=True):
+        assert abs(draws.count(mode) / 4000 - p) <= 3 * (p * (1 - p) / 4000) ** 0.5
+
+
+@pytest.mark.parametrize(("length", "blocks", "feather"), [(30, 3, 1 / 6), (17, 3, 0.5), (9, 1, 0.2), (12, 4, 0.0)])
+def test_block_weights_are_a_partition_of_unity(length: int, blocks: int, feather: float) -> None:
+    weights = _block_weights(length, blocks, feather)
+    assert weights.min() >= 0
+    torch.testing.assert_close(weights.sum(0), torch.ones(length))
+
+
+def test_seams_of_the_blockwise_warp_are_smooth() -> None:
+    config = AugmentConfig()
+    height, width = 120, 160
+    smooth = warp_grid(Mode.BLOCK, config, height, width, _generator(3))
+    hard = warp_grid(Mode.BLOCK, AugmentConfig(feather=0.0), height, width, _generator(3))
+
+    def largest_jump(grid: torch.Tensor) -> float:
+        offset = grid - identity_grid(height, width)
+        return float(torch.maximum(offset.diff(dim=0).abs().max(), offset.diff(dim=1).abs().max()))
+
+    assert largest_jump(smooth) < 0.35 * largest_jump(hard)
+
+
+@pytest.mark.parametrize("mode", [Mode.GLOBAL, Mode.BLOCK, Mode.GLOBAL_AND_BLOCK])
+def test_warps_are_weak_but_real(mode: Mode) -> None:
+    moves = []
+    for seed in range(30):
+        grid = warp_grid(mode, AugmentConfig(), 60, 80, _generator(seed))
+        moves.append(float((grid - identity_grid(60, 80)).norm(dim=-1).mean()))
+    assert 0.005 < sum(moves) / len(moves) < 0.1  # in half-widths: a few pixels of 80
+
+
+def test_rotation_is_a_rotation_for_any_aspect() -> None:
+    # Only rotation on: distances in pixels are preserved, which fails if the aspect is forgotten.
+    config = AugmentConfig(rotation_deg=10, translation=0, scale=0, shear_deg=0)
+    height, width = 40, 120
+    grid = warp_grid(Mode.GLOBAL, config, height, width, _generator(5))
+    pixels = (grid + 1) / 2 * torch.tensor([width, height])
+    steps = pixels.diff(dim=1).norm(dim=-1)
+    torch.testing.assert_close(steps, torch.ones_like(steps), atol=1e-4, rtol=0)
+    assert float((pixels[:, 0, 1] - pixels[:, -1, 1]).abs().max()) > 0.5, "the test must see a rotation"
+
+
+def test_probabilities_must_sum_to_one() -> None:
+    with pytest.raises(ValueError, match="sum to 1"):
+        AugmentConfig(identity=0.5)

@@ -1,0 +1,212 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sceneexpander.adaptation.config import AdaptConfig, AugmentConfig, Gauge, SubsetRule
+from sceneexpander.adaptation.loop import (
+    AdaptationInputs,
+    AdaptationResult,
+    NonFiniteLoss,
+    StepRecord,
+    adapt,
+)
+from sceneexpander.artifacts.anchors import Anchors
+from sceneexpander.artifacts.store import sha256_of_tensors
+from tests.support.tiny_model import TinyReconstructor, tiny_images
+
+FAST = AdaptConfig(steps=8, learning_rate=1e-2, restore_interval=3, restore_rate=0.05, checkpoint_every=3)
+NO_AUGMENT = AugmentConfig(identity=1, global_affine=0, blockwise=0, global_and_block=0)
+
+
+def _inputs(captured: int = 4, inserted_seed: int = 9) -> AdaptationInputs:
+    images = tiny_images(captured)
+    with torch.no_grad():
+        frozen = TinyReconstructor().predict(images)
+    anchors = Anchors(
+        weights_sha256="0",
+        view_ids=tuple(f"{i:03d}" for i in range(captured)),
+        camera_vector=frozen.camera_vector,
+        depth=frozen.depth,
+        depth_conf=frozen.depth_conf,
+        normals=frozen.normals,
+        normals_conf=frozen.normals_conf,
+    )
+    return AdaptationInputs(
+        captured=images,
+        inserted=tiny_images(1, seed=inserted_seed)[0],
+        anchors=anchors,
+        captured_priors=None,
+        joint_priors=None,
+    )
+
+
+def _run(config: AdaptConfig = FAST, inputs: AdaptationInputs | None = None, seed: int = 0) -> AdaptationResult:
+    return adapt(TinyReconstructor(), inputs or _inputs(), config, seed=seed)
+
+
+def _bits(result: AdaptationResult) -> str:
+    return sha256_of_tensors(result.student)
+
+
+def test_zero_steps_leave_the_model_bit_for_bit() -> None:
+    model = TinyReconstructor()
+    before = sha256_of_tensors(model.state_dict())
+    result = adapt(model, _inputs(), replace(FAST, steps=0), seed=0)
+    assert sha256_of_tensors(model.state_dict()) == before == _bits(result)
+    assert result.records == ()
+
+
+def test_with_p_0_the_inserted_view_never_touches_the_student() -> None:
+    config = replace(FAST, insertion_probability=0.0)
+    runs = {_bits(_run(config, _inputs(inserted_seed=seed))) for seed in (9, 10)}
+    assert len(runs) == 1
+    nan = _inputs()
+    poisoned = replace(nan, inserted=torch.full_like(nan.inserted, float("nan")))
+    assert _bits(_run(config, poisoned)) in runs
+
+
+def test_with_p_1_the_inserted_view_matters() -> None:
+    config = replace(FAST, insertion_probability=1.0)
+    assert len({_bits(_run(config, _inputs(inserted_seed=seed))) for seed in (9, 10)}) == 2
+
+
+def test_the_anchors_are_not_changed() -> None:
+    inputs = _inputs()
+    names = ("camera_vector", "depth", "normals", "depth_conf", "normals_conf")
+    before = sha256_of_tensors({n: getattr(inputs.anchors, n) for n in names})
+    _run(inputs=inputs)
+    assert sha256_of_tensors({n: getattr(inputs.anchors, n) for n in names}) == before
+
+
+def test_gaussian_and_point_heads_are_not_run() -> None:
+    model = TinyReconstructor()
+    adapt(model, _inputs(), FAST, seed=0)
+    assert model.runs["gaussians"] == model.runs["points"] == 0
+    assert model.runs["depth"] == FAST.steps
+
+
+def test_the_teacher_runs_only_on_steps_with_the_inserted_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[bool] = []
+    original = TinyReconstructor.predict
+
+    def spy(self: TinyReconstructor, *args: object, **kwargs: object) -> object:
+        calls.append(torch.is_grad_enabled())
+        return original(self, *args, **kwargs)
+
+    monkeypatch.setattr(TinyReconstructor, "predict", spy)
+    inputs = _inputs()
+    calls.clear()
+    result = adapt(TinyReconstructor(), inputs, FAST, seed=2)
+    inserted = sum(r.inserted for r in result.records)
+    assert 0 < inserted < FAST.steps, "the seed must give both kinds of step"
+    assert calls.count(False) == inserted
+    assert calls.count(True) == FAST.steps
+
+
+def test_same_seed_same_bits_other_seed_other_bits() -> None:
+    assert _bits(_run(seed=0)) == _bits(_run(seed=0))
+    assert _bits(_run(seed=0)) != _bits(_run(seed=1))
+
+
+@pytest.mark.parametrize("stop_after", [3, 4, 7])
+def test_a_resumed_run_gives_the_bits_of_an_unbroken_one(tmp_path: Path, stop_after: int) -> None:
+    class Killed(Exception):
+        pass
+
+    def kill(record: StepRecord) -> None:
+        if record.step == stop_after:
+            raise Killed
+
+    inputs, folder = _inputs(), tmp_path / "checkpoint"
+    with pytest.raises(Killed):
+        adapt(TinyReconstructor(), inputs, FAST, seed=0, checkpoint_folder=folder, on_step=kill)
+    steps: list[int] = []
+    resumed = adapt(
+        TinyReconstructor(), inputs, FAST, seed=0, checkpoint_folder=folder, on_step=lambda r: steps.append(r.step)
+    )
+    unbroken = _run(inputs=inputs)
+    assert _bits(resumed) == _bits(unbroken)
+    assert sha256_of_tensors(resumed.teacher) == sha256_of_tensors(unbroken.teacher)
+    assert resumed.records == unbroken.records
+    assert steps == list(range(1, FAST.steps + 1))
+
+
+def test_the_checkpoint_of_another_run_is_not_used(tmp_path: Path) -> None:
+    inputs, folder = _inputs(), tmp_path / "checkpoint"
+    adapt(TinyReconstructor(), inputs, FAST, seed=0, checkpoint_folder=folder)
+    assert folder.exists()
+    other = replace(FAST, learning_rate=5e-3)
+    assert _bits(adapt(TinyReconstructor(), inputs, other, seed=0, checkpoint_folder=folder)) == _bits(
+        _run(other, inputs)
+    )
+
+
+def test_a_damaged_checkpoint_is_ignored(tmp_path: Path) -> None:
+    inputs, folder = _inputs(), tmp_path / "checkpoint"
+    adapt(TinyReconstructor(), inputs, FAST, seed=0, checkpoint_folder=folder)
+    (folder / "tensors.safetensors").write_bytes(b"half")
+    assert _bits(adapt(TinyReconstructor(), inputs, FAST, seed=0, checkpoint_folder=folder)) == _bits(
+        _run(inputs=inputs)
+    )
+
+
+@pytest.mark.parametrize("captured", [1, 2, 3, 4])
+@pytest.mark.parametrize("gauge", list(Gauge))
+def test_any_small_number_of_captured_views(captured: int, gauge: Gauge) -> None:
+    result = _run(replace(FAST, gauge=gauge), _inputs(captured))
+    assert len(result.records) == FAST.steps
+    assert all(torch.isfinite(v).all() for v in result.student.values())
+
+
+@pytest.mark.parametrize("captured", [1, 2, 3, 4])
+def test_the_unadapted_model_has_no_anchor_loss_on_the_full_unwarped_set(captured: int) -> None:
+    # All views, no augmentation, no insertion: the student sees what the anchors were made from, in the same gauge.
+    config = replace(
+        FAST, steps=1, subset=SubsetRule.ALL, augment=NO_AUGMENT, insertion_probability=0.0, gauge=Gauge.KEEP_FIRST
+    )
+    record = _run(config, _inputs(captured)).records[0]
+    assert record.anchor_camera + record.anchor_depth + record.anchor_normal < 1e-6
+
+
+def test_adaptation_pulls_the_captured_views_back_to_their_anchors() -> None:
+    config = replace(
+        FAST, steps=60, insertion_probability=1.0, subset=SubsetRule.ALL, augment=NO_AUGMENT, learning_rate=3e-3
+    )
+    records = _run(config).records
+    first, last = (sum((r.anchor_camera, r.anchor_depth, r.anchor_normal)) for r in (records[0], records[-1]))
+    assert last < 0.5 * first
+
+
+def test_warped_targets_change_the_loss_of_warped_views_only() -> None:
+    always = AugmentConfig(identity=0, global_affine=1, blockwise=0, global_and_block=0)
+    plain = _run(replace(FAST, augment=always)).records[0]
+    warped = _run(replace(FAST, augment=always, warp_targets=True)).records[0]
+    assert plain.anchor_depth != warped.anchor_depth
+    still = replace(FAST, augment=NO_AUGMENT)
+    assert _bits(_run(still)) == _bits(_run(replace(still, warp_targets=True)))
+
+
+def test_the_drift_term_holds_the_weights_back() -> None:
+    free, held = (_run(replace(FAST, steps=30, lambda_reg=weight)).records[-1].drift for weight in (0.0, 10.0))
+    assert held < 0.5 * free
+
+
+def test_restored_counts_appear_every_k_steps() -> None:
+    records = _run(replace(FAST, restore_interval=4, restore_rate=0.5)).records
+    assert [r.step for r in records if r.restored] == [4, 8]
+
+
+def test_a_non_finite_loss_stops_the_run_and_names_the_term() -> None:
+    inputs = _inputs()
+    poisoned = replace(inputs, inserted=torch.full_like(inputs.inserted, float("nan")))
+    with pytest.raises(NonFiniteLoss, match=r"at step \d+"):
+        _run(replace(FAST, insertion_probability=1.0), poisoned)
+
+
+@pytest.mark.parametrize("change", [lambda i: replace(i, captured=i.captured[:3])])
+def test_views_and_anchors_must_match(change: Callable[[AdaptationInputs], AdaptationInputs]) -> None:
+    with pytest.raises(ValueError, match="3 captured views, 4 anchors"):
+        _run(inputs=change(_inputs()))
