@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
@@ -34,6 +35,13 @@ class UserError(Exception):
         if self.fix:
             text = f"{text}; {self.fix}"
         return " ".join(text.split())
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """What to do about an unknown word: the nearest known one, or all of them. Meant for `UserError.fix`."""
+    choices = sorted(known)
+    close = difflib.get_close_matches(word, choices, n=1, cutoff=0.6)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(choices)}"
 
 
 def entry_point(main: Callable[..., Result]) -> Callable[..., Result]:

@@ -1,0 +1,27 @@
+"""From folders of photos to prepared scenes."""
+
+from sceneexpander.ingest.config import Fit, IngestConfig
+from sceneexpander.ingest.decode import Picture, decode_picture, read_picture
+from sceneexpander.ingest.fit import FittedPicture, FrameSize, common_frame, fit_picture
+from sceneexpander.ingest.listing import list_pictures, safe_name
+from sceneexpander.ingest.load import LoadedViews, load_photos, load_scene, read_views
+from sceneexpander.ingest.scene_file import make_round
+
+__all__ = [
+    "Fit",
+    "FittedPicture",
+    "FrameSize",
+    "IngestConfig",
+    "LoadedViews",
+    "Picture",
+    "common_frame",
+    "decode_picture",
+    "fit_picture",
+    "list_pictures",
+    "load_photos",
+    "load_scene",
+    "make_round",
+    "read_picture",
+    "read_views",
+    "safe_name",
+]
