@@ -1,0 +1,912 @@
+// Rasteriser of 3D Gaussians with gradients, for CPUs. C ABI, C++17, no dependencies, own threads.
+//
+// One call renders one view. The plan:
+//   project   every Gaussian once -> a compact record, a tile rectangle and a depth key
+//   order     stable radix sort of the Gaussians (not of the intersections) by the bits of their depth
+//   bin       stable counting sort of the ordered Gaussians into tiles, in bands of tile rows when memory would not do
+//   blend     per tile, front to back: windows of kLanes pixels over the rows of a Gaussian's box
+//   backward  per tile, front to back again, each (Gaussian, tile) pair writes sums into a slot of its own;
+//             then per Gaussian, the slots are summed in a fixed order and carried through the projection
+// Nothing depends on how work was dealt to threads: the results are the same bits for every thread count.
+//
+// Pixels of a tile live in rows padded by one window, so that a window may start at any column. A pixel that takes no more
+// light has a transmittance <= 0, so the padding (0) and finished pixels (negated) need no mask.
+//
+// Vectors are GCC/Clang vector types of the machine's own width: loops over bool masks are not vectorised reliably.
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <exception>
+#include <limits>
+#include <memory>
+#include <thread>
+#include <vector>
+
+#define SX_API extern "C" __attribute__((visibility("default")))
+#define SX_INLINE inline __attribute__((always_inline))
+
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int kLanes = 16;
+#elif defined(__AVX__)
+constexpr int kLanes = 8;
+#else
+constexpr int kLanes = 4;
+#endif
+
+typedef float Vec __attribute__((vector_size(4 * kLanes)));
+typedef int32_t Mask __attribute__((vector_size(4 * kLanes)));
+
+constexpr int kTileW = 16;
+constexpr int kTileH = 16;
+constexpr int kStride = kTileW + kLanes;  // of a row of tile pixels, see above
+constexpr int kPixels = kTileH * kStride;
+constexpr int kMoments = 6;        // sums over pixels: v, v dx, v dy, v dx^2, v dx dy, v dy^2
+constexpr int kDoneEvery = 16;     // Gaussians between two tests whether a tile is finished
+constexpr int kChunk = 2048;       // Gaussians per unit of work; fixed, so that partial sums do not depend on threads
+constexpr float kMinAlpha = 1.0f / 255.0f;
+constexpr float kMinTransmittance = 1e-4f;
+constexpr float kMinDeterminant = 1e-10f;
+constexpr float kMinCompensation = 0.005f;
+constexpr float kJacobianMargin = 0.15f;  // of the image size, beyond which the local affine map is frozen
+constexpr float kLog2E = 1.4426950408889634f;
+constexpr uint32_t kCulled = 0xffffffffu;
+
+// ------------------------------------------------------------------------------------------------ small tools
+
+SX_INLINE Vec load(const float* p) {
+  Vec v;
+  std::memcpy(&v, p, sizeof v);
+  return v;
+}
+SX_INLINE void store(float* p, Vec v) { std::memcpy(p, &v, sizeof v); }
+SX_INLINE Vec splat(float x) { return Vec{} + x; }
+SX_INLINE Vec keep(Mask mask, Vec v) { return (Vec)((Mask)v & mask); }  // v where the mask holds, else 0
+SX_INLINE Vec iota() {
+  Vec v{};
+  for (int lane = 0; lane < kLanes; ++lane) v[lane] = static_cast<float>(lane);
+  return v;
+}
+SX_INLINE float lane_sum(Vec v) {
+  float lanes[kLanes];
+  store(lanes, v);
+  for (int half = kLanes / 2; half > 0; half /= 2)
+    for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
+  return lanes[0];
+}
+
+// 2^t by a polynomial on [-1/2, 1/2] (relative error 7.5e-8); meaningless below t = -126, where callers mask it.
+SX_INLINE Vec exp2_vec(Vec t) {
+  const Vec magic = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer, held in the low mantissa bits
+  const Vec shifted = t + magic;
+  const Vec f = t - (shifted - magic);
+  Vec p = splat(1.32764641e-3f);
+  p = p * f + 9.67554127e-3f;
+  p = p * f + 5.5507133e-2f;
+  p = p * f + 2.40221197e-1f;
+  p = p * f + 6.93146967e-1f;
+  p = p * f + 1.00000007f;
+  return (Vec)((Mask)p + ((Mask)shifted << 23));
+}
+
+// Runs fn(0..count-1) on up to `threads` threads, each pulling the next index. Rethrows the first exception.
+template <class Fn>
+void parallel_for(int threads, int64_t count, const Fn& fn) {
+  std::atomic<int64_t> next{0};
+  std::exception_ptr failure;
+  std::atomic<bool> failed{false};
+  auto work = [&] {
+    try {
+      for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) fn(i);
+    } catch (...) {
+      if (!failed.exchange(true)) failure = std::current_exception();
+    }
+  };
+  std::vector<std::thread> team;
+  const int64_t helpers = std::min<int64_t>(threads, count) - 1;
+  for (int64_t i = 0; i < helpers; ++i) {
+    try {
+      team.emplace_back(work);
+    } catch (const std::exception&) {
+      break;  // the system gives no more threads: fewer do the same work
+    }
+  }
+  work();
+  for (auto& thread : team) thread.join();
+  if (failure) std::rethrow_exception(failure);
+}
+
+template <class T>
+std::unique_ptr<T[]> uninitialised(size_t count) {
+  return std::unique_ptr<T[]>(new T[count]);
+}
+
+}  // namespace
+
+// ------------------------------------------------------------------------------------------------ C ABI structures
+
+// Mirrored by ctypes in kernel_backend.py: keep the two in step.
+struct SxScene {
+  int64_t count;
+  int64_t band_bytes;  // budget for one band's intersections
+  int32_t width, height;
+  int32_t sh_coefficients;  // per colour channel; 0: colours are RGB
+  int32_t with_depth;       // camera z as a channel after RGB
+  int32_t extra_channels;
+  int32_t antialiased;
+  int32_t threads;
+  float near_plane, far_plane, eps2d, max_alpha;
+  const float* means;           // [N,3]
+  const float* quats;           // [N,4] wxyz, any length
+  const float* scales;          // [N,3]
+  const float* opacities;       // [N]
+  const float* colours;         // [N,3] or [N,sh_coefficients,3]
+  const float* extras;          // [N,extra_channels] or null
+  const float* offsets;         // [N,2] added to the projected means, or null
+  const float* cam_from_world;  // [4,4]
+  const float* intrinsics;      // [3,3]
+};
+
+// Gradients are added to what the buffers hold.
+struct SxGradients {
+  float *means, *quats, *scales, *opacities, *colours;
+  float* extras;          // or null
+  float* offsets;         // or null
+  float* cam_from_world;  // [4,4]
+};
+
+namespace {
+
+// ------------------------------------------------------------------------------------------------ projection
+
+struct Camera {
+  float r[9], t[3], position[3];
+  float fx, fy, cx, cy;
+  float x_low, x_high, y_low, y_high;  // limits of x/z and y/z inside the Jacobian
+
+  explicit Camera(const SxScene& s) {
+    const float* m = s.cam_from_world;
+    for (int i = 0; i < 3; ++i) {
+      for (int j = 0; j < 3; ++j) r[3 * i + j] = m[4 * i + j];
+      t[i] = m[4 * i + 3];
+    }
+    for (int j = 0; j < 3; ++j) position[j] = -(r[j] * t[0] + r[3 + j] * t[1] + r[6 + j] * t[2]);
+    fx = s.intrinsics[0], fy = s.intrinsics[4], cx = s.intrinsics[2], cy = s.intrinsics[5];
+    const float w = static_cast<float>(s.width), h = static_cast<float>(s.height);
+    x_low = -(cx + kJacobianMargin * w) / fx, x_high = (w - cx + kJacobianMargin * w) / fx;
+    y_low = -(cy + kJacobianMargin * h) / fy, y_high = (h - cy + kJacobianMargin * h) / fy;
+  }
+};
+
+SX_INLINE float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+// Everything between a Gaussian and its ellipse on the image; the backward pass recomputes it.
+struct Projection {
+  float p[3];                // mean in the camera frame
+  float inv_z, rx, ry;       // 1/z, clamped x/z and y/z
+  bool x_free, y_free;       // not clamped
+  float q[4], inv_norm;      // unit quaternion, 1/length of the given one
+  float rot[9];              // world_from_gaussian
+  float a[9];                // cam_from_gaussian, scaled: R * rot * diag(s)
+  float j00, j02, j11, j12;  // Jacobian
+  float v0[3], v1[3];        // rows of J * a: cov = v v^T
+  float xx, xy, yy;          // covariance before the blur
+  float det0, det1;          // determinants before and after the blur
+  float bx, by;              // diagonal after the blur
+  float compensation;        // of the opacity, antialiased mode
+  float opacity;             // compensated
+  float u, v;                // mean on the image
+};
+
+SX_INLINE void rotation_from_quat(const float* q, float* m) {
+  const float w = q[0], x = q[1], y = q[2], z = q[3];
+  m[0] = 1 - 2 * (y * y + z * z), m[1] = 2 * (x * y - w * z), m[2] = 2 * (x * z + w * y);
+  m[3] = 2 * (x * y + w * z), m[4] = 1 - 2 * (x * x + z * z), m[5] = 2 * (y * z - w * x);
+  m[6] = 2 * (x * z - w * y), m[7] = 2 * (y * z + w * x), m[8] = 1 - 2 * (x * x + y * y);
+}
+
+// False where the Gaussian cannot be seen. Tests are written so that NaN fails them.
+SX_INLINE bool project(const SxScene& s, const Camera& cam, int64_t g, Projection& o) {
+  const float* m = s.means + 3 * g;
+  for (int i = 0; i < 3; ++i) o.p[i] = dot3(cam.r + 3 * i, m) + cam.t[i];
+  const float z = o.p[2];
+  if (!(z > s.near_plane) || !(z < s.far_plane)) return false;
+  if (!(s.opacities[g] >= kMinAlpha)) return false;
+
+  const float* q = s.quats + 4 * g;
+  o.inv_norm = 1.0f / std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  for (int i = 0; i < 4; ++i) o.q[i] = q[i] * o.inv_norm;
+  rotation_from_quat(o.q, o.rot);
+  const float* scale = s.scales + 3 * g;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+      o.a[3 * i + j] =
+          (cam.r[3 * i] * o.rot[j] + cam.r[3 * i + 1] * o.rot[3 + j] + cam.r[3 * i + 2] * o.rot[6 + j]) * scale[j];
+
+  o.inv_z = 1.0f / z;
+  const float x_ratio = o.p[0] * o.inv_z, y_ratio = o.p[1] * o.inv_z;
+  o.rx = std::min(std::max(x_ratio, cam.x_low), cam.x_high);
+  o.ry = std::min(std::max(y_ratio, cam.y_low), cam.y_high);
+  o.x_free = o.rx == x_ratio, o.y_free = o.ry == y_ratio;
+  o.j00 = cam.fx * o.inv_z, o.j02 = -cam.fx * o.rx * o.inv_z;
+  o.j11 = cam.fy * o.inv_z, o.j12 = -cam.fy * o.ry * o.inv_z;
+  for (int j = 0; j < 3; ++j) {
+    o.v0[j] = o.j00 * o.a[j] + o.j02 * o.a[6 + j];
+    o.v1[j] = o.j11 * o.a[3 + j] + o.j12 * o.a[6 + j];
+  }
+  o.xx = dot3(o.v0, o.v0), o.xy = dot3(o.v0, o.v1), o.yy = dot3(o.v1, o.v1);
+  o.bx = o.xx + s.eps2d, o.by = o.yy + s.eps2d;
+  // |v0 x v1|^2 cannot turn negative, xx * yy - xy^2 can.
+  const float n0 = o.v0[1] * o.v1[2] - o.v0[2] * o.v1[1];
+  const float n1 = o.v0[2] * o.v1[0] - o.v0[0] * o.v1[2];
+  const float n2 = o.v0[0] * o.v1[1] - o.v0[1] * o.v1[0];
+  o.det0 = n0 * n0 + n1 * n1 + n2 * n2;
+  o.det1 = o.det0 + s.eps2d * (o.xx + o.yy) + s.eps2d * s.eps2d;
+  if (!(o.det1 > kMinDeterminant)) return false;
+
+  o.compensation = s.antialiased ? std::max(kMinCompensation, std::sqrt(o.det0 / o.det1)) : 1.0f;
+  o.opacity = s.opacities[g] * o.compensation;
+  if (!(o.opacity >= kMinAlpha)) return false;
+  o.u = cam.fx * x_ratio + cam.cx, o.v = cam.fy * y_ratio + cam.cy;
+  if (s.offsets) o.u += s.offsets[2 * g], o.v += s.offsets[2 * g + 1];
+  return true;
+}
+
+// ------------------------------------------------------------------------------------------------ spherical harmonics
+
+// Real spherical harmonics up to degree 3 in the usual 3DGS order and signs.
+SX_INLINE void sh_basis(int coefficients, float x, float y, float z, float* b) {
+  b[0] = 0.28209479177387814f;
+  if (coefficients <= 1) return;
+  b[1] = -0.4886025119029199f * y, b[2] = 0.4886025119029199f * z, b[3] = -0.4886025119029199f * x;
+  if (coefficients <= 4) return;
+  const float xx = x * x, yy = y * y, zz = z * z;
+  b[4] = 1.0925484305920792f * x * y, b[5] = -1.0925484305920792f * y * z;
+  b[6] = 0.31539156525252005f * (2 * zz - xx - yy);
+  b[7] = -1.0925484305920792f * x * z, b[8] = 0.5462742152960396f * (xx - yy);
+  if (coefficients <= 9) return;
+  b[9] = -0.5900435899266435f * y * (3 * xx - yy), b[10] = 2.890611442640554f * x * y * z;
+  b[11] = -0.4570457994644658f * y * (4 * zz - xx - yy);
+  b[12] = 0.3731763325901154f * z * (2 * zz - 3 * xx - 3 * yy);
+  b[13] = -0.4570457994644658f * x * (4 * zz - xx - yy);
+  b[14] = 1.445305721320277f * z * (xx - yy), b[15] = -0.5900435899266435f * x * (xx - 3 * yy);
+}
+
+// d/d(x, y, z) of sum_k weight[k] * basis[k](x, y, z).
+SX_INLINE void sh_gradient(int coefficients, float x, float y, float z, const float* w, float* d) {
+  d[0] = d[1] = d[2] = 0;
+  if (coefficients <= 1) return;
+  d[0] += -0.4886025119029199f * w[3], d[1] += -0.4886025119029199f * w[1], d[2] += 0.4886025119029199f * w[2];
+  if (coefficients <= 4) return;
+  const float c0 = 1.0925484305920792f, c1 = 0.31539156525252005f, c2 = 0.5462742152960396f;
+  d[0] += c0 * (y * w[4] - z * w[7]) - 2 * c1 * x * w[6] + 2 * c2 * x * w[8];
+  d[1] += c0 * (x * w[4] - z * w[5]) - 2 * c1 * y * w[6] - 2 * c2 * y * w[8];
+  d[2] += -c0 * (y * w[5] + x * w[7]) + 4 * c1 * z * w[6];
+  if (coefficients <= 9) return;
+  const float xx = x * x, yy = y * y, zz = z * z;
+  const float k0 = 0.5900435899266435f, k1 = 2.890611442640554f, k2 = 0.4570457994644658f;
+  const float k3 = 0.3731763325901154f, k4 = 1.445305721320277f;
+  d[0] += -6 * k0 * x * y * w[9] + k1 * y * z * w[10] + 2 * k2 * x * y * w[11] - 6 * k3 * x * z * w[12] -
+          k2 * (4 * zz - 3 * xx - yy) * w[13] + 2 * k4 * x * z * w[14] - 3 * k0 * (xx - yy) * w[15];
+  d[1] += -3 * k0 * (xx - yy) * w[9] + k1 * x * z * w[10] - k2 * (4 * zz - xx - 3 * yy) * w[11] -
+          6 * k3 * y * z * w[12] + 2 * k2 * x * y * w[13] - 2 * k4 * y * z * w[14] + 6 * k0 * x * y * w[15];
+  d[2] += k1 * x * y * w[10] - 8 * k2 * y * z * w[11] + k3 * (6 * zz - 3 * xx - 3 * yy) * w[12] -
+          8 * k2 * x * z * w[13] + k4 * (xx - yy) * w[14];
+}
+
+struct Direction {
+  float d[3], inv_length;
+};
+
+SX_INLINE Direction view_direction(const SxScene& s, const Camera& cam, int64_t g) {
+  Direction out;
+  float length2 = 0;
+  for (int i = 0; i < 3; ++i) {
+    out.d[i] = s.means[3 * g + i] - cam.position[i];
+    length2 += out.d[i] * out.d[i];
+  }
+  out.inv_length = length2 > 0 ? 1.0f / std::sqrt(length2) : 0.0f;
+  for (float& component : out.d) component *= out.inv_length;
+  return out;
+}
+
+SX_INLINE void shade(const SxScene& s, const Camera& cam, int64_t g, float* rgb) {
+  const int n = s.sh_coefficients;
+  if (n == 0) {
+    for (int c = 0; c < 3; ++c) rgb[c] = s.colours[3 * g + c];
+    return;
+  }
+  float basis[16];
+  const Direction dir = view_direction(s, cam, g);
+  sh_basis(n, dir.d[0], dir.d[1], dir.d[2], basis);
+  const float* sh = s.colours + static_cast<int64_t>(3) * n * g;
+  rgb[0] = rgb[1] = rgb[2] = 0.5f;
+  for (int k = 0; k < n; ++k)
+    for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * sh[3 * k + c];
+  for (int c = 0; c < 3; ++c) rgb[c] = std::max(rgb[c], 0.0f);
+}
+
+// ------------------------------------------------------------------------------------------------ a view
+
+// What blending needs of a Gaussian: log2(alpha) = level + qa dx^2 + qb dx dy + qc dy^2, box in pixels (end exclusive).
+template <int NC>
+struct alignas(64) Record {
+  float u, v, qa, qb, qc, level;
+  int16_t x0, x1, y0, y1;
+  float feature[NC];
+};
+
+struct Rect {
+  uint16_t x0, x1, y0, y1;  // in tiles, end exclusive; empty where culled
+};
+
+struct Bins {  // Gaussians of each tile of a band, in depth order
+  int row0 = 0, row1 = 0;
+  std::vector<uint64_t> start;
+  std::unique_ptr<uint32_t[]> entries;
+};
+
+struct View {
+  int64_t count = 0;
+  int tiles_x = 0, tiles_y = 0, channels = 0;
+  std::unique_ptr<Rect[]> rects;  // by Gaussian
+  std::vector<uint32_t> order;    // visible Gaussians by depth
+  std::vector<Rect> ordered_rects;
+  std::vector<int> bands;  // boundaries in tile rows
+  Bins bins;               // kept for the backward pass if there is only one band
+  virtual ~View() = default;
+};
+
+template <int NC>
+struct ViewOf : View {
+  std::unique_ptr<Record<NC>[]> records;  // by Gaussian; only those of visible ones are set
+};
+
+int channels_of(const SxScene& s) { return 3 + (s.with_depth ? 1 : 0) + s.extra_channels; }
+
+template <int NC>
+bool make_record(const SxScene& s, const Camera& cam, int64_t g, Projection& o, Record<NC>& rec, float& radius) {
+  if (!project(s, cam, g, o)) return false;
+  // alpha >= 1/255 inside this ellipse only; the margin absorbs rounding.
+  const float extent = 2.0f * std::log(255.0f * o.opacity) + 1e-4f;
+  const float half_w = std::sqrt(extent * o.bx), half_h = std::sqrt(extent * o.by);
+  const float w = static_cast<float>(s.width), h = static_cast<float>(s.height);
+  const float x0 = std::max(std::ceil(o.u - half_w - 0.5f), 0.0f), x1 = std::min(std::floor(o.u + half_w + 0.5f), w);
+  const float y0 = std::max(std::ceil(o.v - half_h - 0.5f), 0.0f), y1 = std::min(std::floor(o.v + half_h + 0.5f), h);
+  if (!(x0 < x1) || !(y0 < y1)) return false;
+  radius = std::max(half_w, half_h);
+  const float k = -0.5f * kLog2E / o.det1;
+  rec.u = o.u, rec.v = o.v;
+  rec.qa = k * o.by, rec.qb = -2.0f * k * o.xy, rec.qc = k * o.bx;
+  rec.level = std::log2(o.opacity);
+  rec.x0 = static_cast<int16_t>(x0), rec.x1 = static_cast<int16_t>(x1);
+  rec.y0 = static_cast<int16_t>(y0), rec.y1 = static_cast<int16_t>(y1);
+  std::fill(rec.feature, rec.feature + NC, 0.0f);
+  shade(s, cam, g, rec.feature);
+  float* rest = rec.feature + 3;
+  if (s.with_depth) *rest++ = o.p[2];
+  if (s.extra_channels) std::copy_n(s.extras + g * s.extra_channels, s.extra_channels, rest);
+  return true;
+}
+
+template <int NC>
+void project_all(const SxScene& s, const Camera& cam, ViewOf<NC>& view, uint32_t* keys, float* radii) {
+  const int64_t chunks = (s.count + kChunk - 1) / kChunk;
+  parallel_for(s.threads, chunks, [&](int64_t chunk) {
+    Projection o;
+    for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); ++g) {
+      Record<NC>& rec = view.records[g];
+      keys[g] = kCulled;
+      radii[g] = 0.0f;
+      view.rects[g] = Rect{0, 0, 0, 0};
+      if (!make_record<NC>(s, cam, g, o, rec, radii[g])) continue;
+      std::memcpy(&keys[g], &o.p[2], sizeof(float));  // positive floats order like their bits
+      view.rects[g] = Rect{static_cast<uint16_t>(rec.x0 / kTileW), static_cast<uint16_t>((rec.x1 - 1) / kTileW + 1),
+                           static_cast<uint16_t>(rec.y0 / kTileH), static_cast<uint16_t>((rec.y1 - 1) / kTileH + 1)};
+    }
+  });
+}
+
+// Stable radix sort of the visible Gaussians by key, 11 bits at a time; a digit that all keys share costs one count only.
+void order_by_depth(int64_t count, const uint32_t* keys, View& view) {
+  struct Item {
+    uint32_t key, index;
+  };
+  std::vector<Item> items, other;
+  items.reserve(count);
+  for (int64_t g = 0; g < count; ++g)
+    if (keys[g] != kCulled) items.push_back({keys[g], static_cast<uint32_t>(g)});
+  other.resize(items.size());
+  for (int shift = 0; shift < 32; shift += 11) {
+    std::vector<size_t> start(2049, 0);
+    for (const Item& item : items) ++start[((item.key >> shift) & 2047) + 1];
+    if (std::find(start.begin(), start.end(), items.size()) != start.end() && !items.empty()) continue;
+    for (int i = 0; i < 2048; ++i) start[i + 1] += start[i];
+    for (const Item& item : items) other[start[(item.key >> shift) & 2047]++] = item;
+    items.swap(other);
+  }
+  view.order.resize(items.size());
+  view.ordered_rects.resize(items.size());
+  for (size_t i = 0; i < items.size(); ++i) {
+    view.order[i] = items[i].index;
+    view.ordered_rects[i] = view.rects[items[i].index];
+  }
+}
+
+// Greedy bands of whole tile rows, each within the budget where a single row is.
+void choose_bands(const SxScene& s, View& view) {
+  std::vector<int64_t> change(view.tiles_y + 1, 0);
+  for (const Rect& r : view.ordered_rects) change[r.y0] += r.x1 - r.x0, change[r.y1] -= r.x1 - r.x0;
+  const int64_t budget = s.band_bytes / static_cast<int64_t>(sizeof(float) * (1 + kMoments + channels_of(s)));
+  view.bands.assign(1, 0);
+  int64_t in_row = 0, in_band = 0;
+  for (int row = 0; row < view.tiles_y; ++row) {
+    in_row += change[row];
+    if (in_band > 0 && in_band + in_row > budget) view.bands.push_back(row), in_band = 0;
+    in_band += in_row;
+  }
+  view.bands.push_back(view.tiles_y);
+}
+
+template <class Fn>
+SX_INLINE void each_tile(const Rect& r, int row0, int row1, int tiles_x, const Fn& fn) {
+  for (int y = std::max<int>(r.y0, row0); y < std::min<int>(r.y1, row1); ++y)
+    for (int x = r.x0; x < r.x1; ++x) fn((y - row0) * tiles_x + x);
+}
+
+// Stable counting sort: each part of the depth order counts, then writes behind the parts before it.
+void fill_bins(const View& view, int threads, int row0, int row1, Bins& bins) {
+  const int64_t tiles = static_cast<int64_t>(row1 - row0) * view.tiles_x;
+  const int64_t visible = static_cast<int64_t>(view.order.size());
+  const int64_t parts = std::max(1, threads);
+  std::vector<uint64_t> cursor(parts * tiles, 0);
+  auto range = [&](int64_t part) { return part * visible / parts; };
+  parallel_for(threads, parts, [&](int64_t part) {
+    uint64_t* mine = cursor.data() + part * tiles;
+    for (int64_t i = range(part); i < range(part + 1); ++i)
+      each_tile(view.ordered_rects[i], row0, row1, view.tiles_x, [&](int tile) { ++mine[tile]; });
+  });
+  bins.row0 = row0, bins.row1 = row1;
+  bins.start.assign(tiles + 1, 0);
+  uint64_t total = 0;
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+    bins.start[tile] = total;
+    for (int64_t part = 0; part < parts; ++part) {
+      const uint64_t in_part = cursor[part * tiles + tile];
+      cursor[part * tiles + tile] = total;
+      total += in_part;
+    }
+  }
+  bins.start[tiles] = total;
+  bins.entries = uninitialised<uint32_t>(total);
+  parallel_for(threads, parts, [&](int64_t part) {
+    uint64_t* mine = cursor.data() + part * tiles;
+    for (int64_t i = range(part); i < range(part + 1); ++i)
+      each_tile(view.ordered_rects[i], row0, row1, view.tiles_x,
+                [&](int tile) { bins.entries[mine[tile]++] = view.order[i]; });
+  });
+}
+
+// ------------------------------------------------------------------------------------------------ blending
+
+struct TileArea {
+  int x, y, w, h;  // pixels of the image that the tile covers
+};
+
+TileArea tile_area(const SxScene& s, int column, int row) {
+  const int x = column * kTileW, y = row * kTileH;
+  return {x, y, std::min(kTileW, s.width - x), std::min(kTileH, s.height - y)};
+}
+
+void start_transmittance(const TileArea& area, float* t) {
+  std::fill(t, t + kPixels, 0.0f);
+  for (int y = 0; y < area.h; ++y) std::fill(t + y * kStride, t + y * kStride + area.w, 1.0f);
+}
+
+bool finished(const float* t) {
+  Vec most = splat(0.0f);
+  for (int i = 0; i < kPixels; i += kLanes) {
+    const Vec v = load(t + i);
+    most = v > most ? v : most;
+  }
+  float lanes[kLanes];
+  store(lanes, most);
+  return *std::max_element(lanes, lanes + kLanes) <= 0.0f;
+}
+
+// The part of a Gaussian's box inside a tile, and its value along one window of columns.
+struct Window {
+  Vec dx, q0, q1;
+
+  template <int NC>
+  SX_INLINE Window(const Record<NC>& g, int x)
+      : dx(iota() + (static_cast<float>(x) + 0.5f - g.u)), q0(dx * dx * g.qa), q1(dx * g.qb) {}
+};
+
+struct Box {
+  int x0, x1, y0, y1;  // in tile pixels
+
+  template <int NC>
+  SX_INLINE Box(const Record<NC>& g, const TileArea& a)
+      : x0(std::max(g.x0 - a.x, 0)),
+        x1(std::min(g.x1 - a.x, kTileW)),
+        y0(std::max(g.y0 - a.y, 0)),
+        y1(std::min(g.y1 - a.y, kTileH)) {}
+};
+
+// Uncapped alpha of a window in one row, 0 where the pair is skipped. Both passes must take the same decisions: one function.
+template <int NC>
+SX_INLINE Vec alpha_of(const Record<NC>& g, const Window& window, float dy) {
+  const Vec power = window.q0 + dy * (window.q1 + g.qc * dy);
+  const Vec exponent = power + g.level;
+  const Mask seen = (power <= 0.0f) & (exponent >= -7.99435343685886f);  // log2(1/255)
+  return keep(seen, exp2_vec(exponent));
+}
+
+template <int NC>
+void blend_tile(const SxScene& s, const Record<NC>* records, const uint32_t* entries, size_t n, const TileArea& area,
+                float* planes, float* transmittance) {
+  alignas(64) float t[kPixels];
+  alignas(64) float colour[NC][kPixels];
+  start_transmittance(area, t);
+  std::memset(colour, 0, sizeof colour);
+  for (size_t i = 0; i < n; ++i) {
+    if (i % kDoneEvery == 0 && i > 0 && finished(t)) break;
+    const Record<NC>& g = records[entries[i]];
+    const Box box(g, area);
+    for (int x = box.x0; x < box.x1; x += kLanes) {
+      const Window window(g, area.x + x);
+      for (int y = box.y0; y < box.y1; ++y) {
+        const int at = y * kStride + x;
+        Vec alpha = alpha_of(g, window, static_cast<float>(area.y + y) + 0.5f - g.v);
+        alpha = alpha < s.max_alpha ? alpha : splat(s.max_alpha);
+        const Vec before = load(t + at);
+        const Vec after = before * (1.0f - alpha);
+        const Mask going = after > kMinTransmittance;
+        const Vec weight = keep(going, before * alpha);
+        const Vec stopped = (Vec)((Mask)before | std::numeric_limits<int32_t>::min());
+        store(t + at, going ? after : stopped);
+        for (int c = 0; c < NC; ++c) store(&colour[c][at], load(&colour[c][at]) + weight * g.feature[c]);
+      }
+    }
+  }
+  const int64_t plane = static_cast<int64_t>(s.width) * s.height;
+  for (int y = 0; y < area.h; ++y) {
+    const int64_t to = static_cast<int64_t>(area.y + y) * s.width + area.x;
+    for (int x = 0; x < area.w; ++x) transmittance[to + x] = std::abs(t[y * kStride + x]);
+    for (int c = 0; c < channels_of(s); ++c) std::memcpy(planes + c * plane + to, &colour[c][y * kStride], 4 * area.w);
+  }
+}
+
+template <int NC>
+View* forward(const SxScene& s, float* planes, float* transmittance, float* radii) {
+  auto view = std::make_unique<ViewOf<NC>>();
+  view->count = s.count;
+  view->channels = NC;
+  view->tiles_x = (s.width + kTileW - 1) / kTileW, view->tiles_y = (s.height + kTileH - 1) / kTileH;
+  view->records = uninitialised<Record<NC>>(s.count);
+  view->rects = uninitialised<Rect>(s.count);
+  {
+    auto keys = uninitialised<uint32_t>(s.count);
+    project_all<NC>(s, Camera(s), *view, keys.get(), radii);
+    order_by_depth(s.count, keys.get(), *view);
+  }
+  choose_bands(s, *view);
+  for (size_t band = 0; band + 1 < view->bands.size(); ++band) {
+    const int row0 = view->bands[band], row1 = view->bands[band + 1];
+    fill_bins(*view, s.threads, row0, row1, view->bins);
+    const Bins& bins = view->bins;
+    parallel_for(s.threads, static_cast<int64_t>(row1 - row0) * view->tiles_x, [&](int64_t tile) {
+      const TileArea area =
+          tile_area(s, static_cast<int>(tile % view->tiles_x), row0 + static_cast<int>(tile / view->tiles_x));
+      blend_tile<NC>(s, view->records.get(), bins.entries.get() + bins.start[tile],
+                     bins.start[tile + 1] - bins.start[tile], area, planes, transmittance);
+    });
+  }
+  if (view->bands.size() > 2) view->bins = Bins();
+  return view.release();
+}
+
+// ------------------------------------------------------------------------------------------------ backward
+
+// Loads one tile of an image plane into padded tile rows.
+void load_tile(const float* plane, int width, const TileArea& area, float* tile) {
+  std::fill(tile, tile + kPixels, 0.0f);
+  for (int y = 0; y < area.h; ++y)
+    std::memcpy(tile + y * kStride, plane + static_cast<int64_t>(area.y + y) * width + area.x, 4 * area.w);
+}
+
+struct Upstream {  // images and the loss's gradients with respect to them
+  const float *planes, *transmittance, *d_planes, *d_alpha;
+};
+
+// With w = T alpha and S = sum of w (c . dC) over the Gaussians behind - dA T_final:
+//   dL/dalpha = T (c . dC) - S / (1 - alpha);  S starts as C . dC - dA T_final and loses each Gaussian as it passes.
+// A slot receives the six moments of v = alpha dL/dalpha over the pixels, then dL/dfeature.
+template <int NC, class SlotOf>
+void blend_tile_backward(const SxScene& s, const Record<NC>* records, const uint32_t* entries, size_t n,
+                         const TileArea& area, const Upstream& up, const SlotOf& slot_of) {
+  alignas(64) float t[kPixels], rest[kPixels];
+  alignas(64) float d_colour[NC][kPixels];
+  alignas(64) float scratch[kPixels];
+  const int64_t plane = static_cast<int64_t>(s.width) * s.height;
+  start_transmittance(area, t);
+  load_tile(up.transmittance, s.width, area, rest);
+  load_tile(up.d_alpha, s.width, area, scratch);
+  for (int i = 0; i < kPixels; ++i) rest[i] *= -scratch[i];
+  for (int c = 0; c < NC; ++c) {
+    if (c >= channels_of(s)) {
+      std::memset(d_colour[c], 0, sizeof d_colour[c]);
+      continue;
+    }
+    load_tile(up.planes + c * plane, s.width, area, scratch);
+    load_tile(up.d_planes + c * plane, s.width, area, d_colour[c]);
+    for (int i = 0; i < kPixels; ++i) rest[i] += scratch[i] * d_colour[c][i];
+  }
+  size_t i = 0;
+  for (; i < n; ++i) {
+    if (i % kDoneEvery == 0 && i > 0 && finished(t)) break;
+    const Record<NC>& g = records[entries[i]];
+    const Box box(g, area);
+    float sums[kMoments + NC] = {};
+    for (int x = box.x0; x < box.x1; x += kLanes) {
+      const Window window(g, area.x + x);
+      Vec m0{}, m1{}, m2{}, d_feature[NC] = {};
+      for (int y = box.y0; y < box.y1; ++y) {
+        const int at = y * kStride + x;
+        const float dy = static_cast<float>(area.y + y) + 0.5f - g.v;
+        const Vec raw = alpha_of(g, window, dy);
+        const Mask free = raw < s.max_alpha;
+        Vec alpha = free ? raw : splat(s.max_alpha);
+        const Vec before = load(t + at);
+        const Vec after = before * (1.0f - alpha);
+        const Mask going = after > kMinTransmittance;
+        const Vec stopped = (Vec)((Mask)before | std::numeric_limits<int32_t>::min());
+        store(t + at, going ? after : stopped);
+        alpha = keep(going, alpha);
+        const Vec weight = before * alpha;
+        Vec along{};
+        for (int c = 0; c < NC; ++c) {
+          const Vec d = load(&d_colour[c][at]);
+          along += d * g.feature[c];
+          d_feature[c] += d * weight;
+        }
+        const Vec own = weight * along;
+        const Vec behind = load(rest + at) - own;
+        store(rest + at, behind);
+        const Vec v = keep(free, own - behind * (alpha / (1.0f - alpha)));
+        const Vec v_dy = v * dy;
+        m0 += v, m1 += v_dy, m2 += v_dy * dy;
+      }
+      const Vec m0_dx = m0 * window.dx;
+      sums[0] += lane_sum(m0), sums[1] += lane_sum(m0_dx), sums[2] += lane_sum(m1);
+      sums[3] += lane_sum(m0_dx * window.dx), sums[4] += lane_sum(m1 * window.dx), sums[5] += lane_sum(m2);
+      for (int c = 0; c < NC; ++c) sums[kMoments + c] += lane_sum(d_feature[c]);
+    }
+    std::memcpy(slot_of(entries[i]), sums, sizeof sums);
+  }
+  for (; i < n; ++i) std::memset(slot_of(entries[i]), 0, sizeof(float) * (kMoments + NC));
+}
+
+// Adds dL/d(view matrix) of one chunk of Gaussians; double, because it sums over the whole scene.
+struct CameraSums {
+  double r[9] = {}, t[3] = {};
+};
+
+void quat_backward(const Projection& o, const float* d, float* out) {  // d: dL/d(rotation matrix)
+  const float w = o.q[0], x = o.q[1], y = o.q[2], z = o.q[3];
+  const float dq[4] = {
+      2 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
+      2 * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - 2 * x * (d[4] + d[8])),
+      2 * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2 * y * (d[0] + d[8])),
+      2 * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2 * z * (d[0] + d[4])),
+  };
+  const float along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;  // the length of a quaternion has no effect
+  for (int i = 0; i < 4; ++i) out[i] += (dq[i] - along * o.q[i]) * o.inv_norm;
+}
+
+// dL/dmean (world) and dL/d(camera position) are opposite: returns the former.
+void shade_backward(const SxScene& s, const Camera& cam, int64_t g, const float* colour, const float* d_rgb,
+                    float* d_colours, float* d_mean) {
+  const int n = s.sh_coefficients;
+  if (n == 0) {
+    for (int c = 0; c < 3; ++c) d_colours[3 * g + c] += d_rgb[c];
+    return;
+  }
+  float basis[16], weight[16], d_dir[3];
+  const Direction dir = view_direction(s, cam, g);
+  sh_basis(n, dir.d[0], dir.d[1], dir.d[2], basis);
+  const float* sh = s.colours + static_cast<int64_t>(3) * n * g;
+  float* d_sh = d_colours + static_cast<int64_t>(3) * n * g;
+  float d[3];
+  for (int c = 0; c < 3; ++c) d[c] = colour[c] > 0.0f ? d_rgb[c] : 0.0f;
+  for (int k = 0; k < n; ++k) {
+    weight[k] = sh[3 * k] * d[0] + sh[3 * k + 1] * d[1] + sh[3 * k + 2] * d[2];
+    for (int c = 0; c < 3; ++c) d_sh[3 * k + c] += basis[k] * d[c];
+  }
+  sh_gradient(n, dir.d[0], dir.d[1], dir.d[2], weight, d_dir);
+  const float along = dot3(d_dir, dir.d);
+  for (int i = 0; i < 3; ++i) d_mean[i] = (d_dir[i] - along * dir.d[i]) * dir.inv_length;
+}
+
+// Carries the summed slot of one Gaussian through its projection.
+void project_backward(const SxScene& s, const Camera& cam, int64_t g, const float* sums, const float* colour,
+                      const SxGradients& grad, CameraSums& cam_sums) {
+  Projection o;
+  if (!project(s, cam, g, o)) return;
+  // Conic (a, b, c) of the blurred covariance, and the mean: sigma = a dx^2 / 2 + b dx dy + c dy^2 / 2, d = pixel - mean.
+  const float a = o.by / o.det1, b = -o.xy / o.det1, c = o.bx / o.det1;
+  const float d_u = a * sums[1] + b * sums[2], d_v = b * sums[1] + c * sums[2];
+  if (grad.offsets) grad.offsets[2 * g] += d_u, grad.offsets[2 * g + 1] += d_v;
+  const float da = -0.5f * sums[3], half_db = -0.5f * sums[4], dc = -0.5f * sums[5];
+  // d(covariance) = -Q dQ Q.
+  const float h00 = a * da + b * half_db, h01 = a * half_db + b * dc;
+  const float h10 = b * da + c * half_db, h11 = b * half_db + c * dc;
+  float d_xx = -(h00 * a + h01 * b), d_xy = -2.0f * (h00 * b + h01 * c), d_yy = -(h10 * b + h11 * c);
+  const float d_opacity = sums[0] / o.opacity;  // of the compensated opacity
+  grad.opacities[g] += d_opacity * o.compensation;
+  if (s.antialiased && o.compensation > kMinCompensation) {
+    const float d_ratio = d_opacity * s.opacities[g] * 0.5f / o.compensation;
+    const float d_det0 = d_ratio / o.det1, d_det1 = -d_ratio * o.det0 / (o.det1 * o.det1);
+    d_xx += d_det0 * o.yy + d_det1 * o.by, d_yy += d_det0 * o.xx + d_det1 * o.bx;
+    d_xy -= 2.0f * o.xy * (d_det0 + d_det1);
+  }
+  float d_a[9], d_j00 = 0, d_j02 = 0, d_j11 = 0, d_j12 = 0;
+  for (int j = 0; j < 3; ++j) {
+    const float d_v0 = 2 * d_xx * o.v0[j] + d_xy * o.v1[j], d_v1 = d_xy * o.v0[j] + 2 * d_yy * o.v1[j];
+    d_a[j] = o.j00 * d_v0, d_a[3 + j] = o.j11 * d_v1, d_a[6 + j] = o.j02 * d_v0 + o.j12 * d_v1;
+    d_j00 += o.a[j] * d_v0, d_j02 += o.a[6 + j] * d_v0;
+    d_j11 += o.a[3 + j] * d_v1, d_j12 += o.a[6 + j] * d_v1;
+  }
+  const float iz = o.inv_z;
+  float d_p[3] = {d_u * o.j00, d_v * o.j11, 0};
+  d_p[2] = -(d_u * o.j00 * o.p[0] + d_v * o.j11 * o.p[1]) * iz;
+  d_p[2] -= iz * (d_j00 * o.j00 + d_j02 * o.j02 + d_j11 * o.j11 + d_j12 * o.j12);
+  if (o.x_free) d_p[0] -= d_j02 * o.j00 * iz, d_p[2] += d_j02 * o.j00 * o.rx * iz;
+  if (o.y_free) d_p[1] -= d_j12 * o.j11 * iz, d_p[2] += d_j12 * o.j11 * o.ry * iz;
+  int channel = kMoments + 3;
+  if (s.with_depth) d_p[2] += sums[channel++];
+  for (int e = 0; e < s.extra_channels; ++e)
+    if (grad.extras) grad.extras[g * s.extra_channels + e] += sums[channel + e];
+
+  const float* scale = s.scales + 3 * g;
+  float d_rot[9], d_scale[3] = {};
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      const float d_m = cam.r[i] * d_a[j] + cam.r[3 + i] * d_a[3 + j] + cam.r[6 + i] * d_a[6 + j];
+      d_scale[j] += o.rot[3 * i + j] * d_m;
+      d_rot[3 * i + j] = d_m * scale[j];
+    }
+  for (int j = 0; j < 3; ++j) grad.scales[3 * g + j] += d_scale[j];
+  quat_backward(o, d_rot, grad.quats + 4 * g);
+
+  const float* m = s.means + 3 * g;
+  float d_seen[3] = {0, 0, 0};  // dL/dmean through the viewing direction
+  shade_backward(s, cam, g, colour, sums + kMoments, grad.colours, d_seen);
+  for (int i = 0; i < 3; ++i)
+    grad.means[3 * g + i] += cam.r[i] * d_p[0] + cam.r[3 + i] * d_p[1] + cam.r[6 + i] * d_p[2] + d_seen[i];
+  for (int i = 0; i < 3; ++i) {
+    cam_sums.t[i] += d_p[i] + dot3(cam.r + 3 * i, d_seen);  // camera position = -R^T t moves against the mean
+    for (int j = 0; j < 3; ++j) {
+      float d_r = d_p[i] * m[j] + cam.t[i] * d_seen[j];
+      for (int k = 0; k < 3; ++k) d_r += d_a[3 * i + k] * scale[k] * o.rot[3 * j + k];
+      cam_sums.r[3 * i + j] += d_r;
+    }
+  }
+}
+
+template <int NC>
+void backward(const SxScene& s, View& base, const Upstream& up, const SxGradients& grad) {
+  constexpr int kSlot = kMoments + NC;
+  auto& view = static_cast<ViewOf<NC>&>(base);
+  const bool banded = view.bands.size() > 2;
+  const int64_t chunks = (s.count + kChunk - 1) / kChunk;
+  std::vector<float> carried(banded ? s.count * kSlot : 0, 0.0f);  // sums of the bands so far
+  std::vector<uint64_t> offset(s.count + 1);
+  std::unique_ptr<float[]> slots;
+  auto add_slots = [&](int64_t g, float* sums) {
+    for (uint64_t slot = offset[g]; slot < offset[g + 1]; ++slot)
+      for (int k = 0; k < kSlot; ++k) sums[k] += slots[slot * kSlot + k];
+  };
+  auto each_gaussian = [&](const auto& fn) {
+    parallel_for(s.threads, chunks, [&](int64_t chunk) {
+      for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); ++g)
+        if (view.rects[g].x0 < view.rects[g].x1) fn(g, chunk);
+    });
+  };
+
+  for (size_t band = 0; band + 1 < view.bands.size(); ++band) {
+    const int row0 = view.bands[band], row1 = view.bands[band + 1];
+    Bins refilled;
+    if (banded) fill_bins(view, s.threads, row0, row1, refilled);
+    const Bins& bins = banded ? refilled : view.bins;
+    uint64_t total = 0;
+    for (int64_t g = 0; g < s.count; ++g) {
+      const Rect& r = view.rects[g];
+      offset[g] = total;
+      total += static_cast<uint64_t>(r.x1 - r.x0) * std::max(0, std::min<int>(r.y1, row1) - std::max<int>(r.y0, row0));
+    }
+    offset[s.count] = total;
+    slots = uninitialised<float>(total * kSlot);
+    parallel_for(s.threads, static_cast<int64_t>(row1 - row0) * view.tiles_x, [&](int64_t tile) {
+      const int column = static_cast<int>(tile % view.tiles_x), row = row0 + static_cast<int>(tile / view.tiles_x);
+      auto slot_of = [&](uint32_t g) {
+        const Rect& r = view.rects[g];
+        const uint64_t within = static_cast<uint64_t>(row - std::max<int>(r.y0, row0)) * (r.x1 - r.x0) + column - r.x0;
+        return slots.get() + (offset[g] + within) * kSlot;
+      };
+      blend_tile_backward<NC>(s, view.records.get(), bins.entries.get() + bins.start[tile],
+                              bins.start[tile + 1] - bins.start[tile], tile_area(s, column, row), up, slot_of);
+    });
+    if (banded) each_gaussian([&](int64_t g, int64_t) { add_slots(g, carried.data() + g * kSlot); });
+  }
+
+  const Camera cam(s);
+  std::vector<CameraSums> cam_sums(chunks);
+  each_gaussian([&](int64_t g, int64_t chunk) {
+    float own[kSlot] = {};
+    float* sums = own;
+    if (banded)
+      sums = carried.data() + g * kSlot;
+    else
+      add_slots(g, own);
+    project_backward(s, cam, g, sums, view.records[g].feature, grad, cam_sums[chunk]);
+  });
+  CameraSums total;
+  for (const CameraSums& part : cam_sums) {
+    for (int i = 0; i < 9; ++i) total.r[i] += part.r[i];
+    for (int i = 0; i < 3; ++i) total.t[i] += part.t[i];
+  }
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) grad.cam_from_world[4 * i + j] += static_cast<float>(total.r[3 * i + j]);
+    grad.cam_from_world[4 * i + 3] += static_cast<float>(total.t[i]);
+  }
+}
+
+// Channel counts are compile-time constants of the inner loops; others are padded with zero channels.
+template <class Fn>
+auto with_channels(int channels, const Fn& fn) {
+  if (channels <= 3) return fn(std::integral_constant<int, 3>());
+  if (channels <= 4) return fn(std::integral_constant<int, 4>());
+  if (channels <= 5) return fn(std::integral_constant<int, 5>());
+  if (channels <= 8) return fn(std::integral_constant<int, 8>());
+  return fn(std::integral_constant<int, 16>());
+}
+
+}  // namespace
+
+// ------------------------------------------------------------------------------------------------ entry points
+
+SX_API int32_t sx_abi_version() { return 1; }
+SX_API int32_t sx_max_channels() { return 16; }
+
+// Renders planes [channels,H,W], transmittance [H,W] and radii [N] (pixels, 0: not seen). Returns the view's state for
+// sx_backward, to be released by sx_free, or null if memory ran out.
+SX_API void* sx_forward(const SxScene* scene, float* planes, float* transmittance, float* radii) {
+  try {
+    return with_channels(channels_of(*scene),
+                         [&](auto nc) { return forward<decltype(nc)::value>(*scene, planes, transmittance, radii); });
+  } catch (const std::exception&) {
+    return nullptr;
+  }
+}
+
+// Adds to `gradients`, given the outputs of sx_forward for the same scene and the loss's gradients. 0, or 1 if memory ran out.
+SX_API int32_t sx_backward(const SxScene* scene, void* state, const float* planes, const float* transmittance,
+                           const float* d_planes, const float* d_alpha, const SxGradients* gradients) {
+  try {
+    const Upstream up{planes, transmittance, d_planes, d_alpha};
+    View& view = *static_cast<View*>(state);
+    with_channels(channels_of(*scene),
+                  [&](auto nc) { return backward<decltype(nc)::value>(*scene, view, up, *gradients); });
+    return 0;
+  } catch (const std::exception&) {
+    return 1;
+  }
+}
+
+SX_API void sx_free(void* state) { delete static_cast<View*>(state); }
