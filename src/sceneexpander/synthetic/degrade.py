@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+Array = NDArray[Any]  # float32
 
 
 def encode_radiance(radiance: Array, exposure: float) -> Array:
@@ -63,6 +65,6 @@ def degrade(images: Array, generator: np.random.Generator) -> Array:
         picture = picture + strength * rng.standard_normal(picture.shape, dtype=np.float32)
         coded = np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)[..., ::-1]
         packed = cv2.imencode(".jpg", coded, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-        decoded = cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1]
+        decoded = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))[..., ::-1]
         out[view] = decoded.transpose(2, 0, 1).astype(np.float32) / np.float32(255)
     return out

@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+#: A float32 array; numpy's stubs widen float32 in mixed arithmetic, so the checker is told only that it is one.
+Array = NDArray[Any]
 Coordinate = Array | np.float32 | float
 
 #: Hits nearer than this are ignored, so that a ray may start on a surface.
@@ -68,7 +70,9 @@ def _round_interval(
     o: Sequence[Coordinate], d: Sequence[Array], radius: Sequence[float], axes: Sequence[int]
 ) -> tuple[Array, Array]:
     """Inside of the ellipse (two axes: infinite cylinder) or ellipsoid (three axes) with the given radii."""
-    a, b, c = np.float32(0), np.float32(0), np.float32(-1)
+    a: Coordinate = np.float32(0)
+    b: Coordinate = np.float32(0)
+    c: Coordinate = np.float32(-1)
     for axis in axes:
         inverse = np.float32(1 / radius[axis])
         direction, origin = d[axis] * inverse, o[axis] * inverse

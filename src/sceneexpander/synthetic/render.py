@@ -51,7 +51,7 @@ def _screen_rectangles(
     cam = (corners - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]
     first, second = cam[:, _EDGES[:, 0]], cam[:, _EDGES[:, 1]]
     step = second[..., 2] - first[..., 2]
-    crossing = (first[..., 2] - _NEAR_PLANE) * (second[..., 2] - _NEAR_PLANE) < 0
+    crossing: NDArray[np.bool_] = np.asarray((first[..., 2] - _NEAR_PLANE) * (second[..., 2] - _NEAR_PLANE) < 0)
     fraction = np.where(crossing, (_NEAR_PLANE - first[..., 2]) / np.where(crossing, step, 1), 0)
     clipped = first + fraction[..., None] * (second - first)
     points = np.concatenate([cam, clipped], axis=1)
@@ -62,7 +62,7 @@ def _screen_rectangles(
     low_x, low_y = (np.where(usable, v, np.inf).min(1) for v in (x, y))
     high_x, high_y = (np.where(usable, v, -np.inf).max(1) for v in (x, y))
     rectangle = np.stack([low_x - 1, high_x + 1, low_y - 1, high_y + 1], axis=1)
-    rectangle = np.where(usable.any(1)[:, None], rectangle, 0)
+    rectangle = np.where(usable.any(axis=1, keepdims=True), rectangle, 0)
     limit = np.array([width, width, height, height])
     result = np.clip(np.array([0, 1, 0, 1]) + np.floor(np.clip(rectangle, -1e6, 1e6)), 0, limit).astype(np.int64)
     result[world.shape == Shape.ROOM] = [0, width, 0, height]
@@ -128,6 +128,23 @@ def _untile(array: Array, height: int, width: int) -> Array:
     return array.reshape(height // TILE, width // TILE, TILE, TILE).swapaxes(1, 2).reshape(height, width)
 
 
+def _near_beam(
+    world: World, blockers: NDArray[np.int64], middle: Array, reach: Array, light_at: Array, sun: bool
+) -> NDArray[np.bool_]:
+    """(tile, blocker): does the blocker's bounding sphere come near the tile's beam towards the light?"""
+    centre = world.centre[blockers]
+    radius = np.sqrt((world.half[blockers] ** 2).sum(-1))
+    towards = np.broadcast_to(light_at, middle.shape) if sun else light_at - middle
+    squared = np.einsum("tk,tk->t", towards, towards)[:, None]
+    along = (towards @ centre.T - np.einsum("tk,tk->t", towards, middle)[:, None]) / squared
+    along = np.maximum(along, 0) if sun else np.clip(along, 0, 1)
+    distance = np.zeros_like(along)
+    for k in range(3):
+        gap = centre[:, k] - middle[:, k, None] - along * towards[:, k, None]
+        distance += gap * gap
+    return distance < (radius + reach[:, None]) ** 2
+
+
 def _shadow(
     world: World, surface: Surface, light_at: NDArray[np.float32], sun: bool, facing: NDArray[np.bool_]
 ) -> Array:
@@ -141,16 +158,12 @@ def _shadow(
     low = np.stack([np.where(active, p, np.inf).min(1) for p in points], -1)[rows_used]
     high = np.stack([np.where(active, p, -np.inf).max(1) for p in points], -1)[rows_used]
     used = np.nonzero(rows_used)[0]
-    middle, reach = (low + high) / 2, np.linalg.norm(high - low, axis=-1) / 2
-    towards = np.broadcast_to(light_at, middle.shape) if sun else light_at - middle
-    radius = np.linalg.norm(world.half, axis=-1)
+    middle, reach = (low + high) / 2, np.sqrt(np.einsum("tk,tk->t", high - low, high - low)) / 2
+    blockers = np.nonzero(world.casts_shadow)[0]
+    near_beam = _near_beam(world, blockers, middle, reach, light_at, sun)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for index in np.nonzero(world.casts_shadow)[0]:
-            to_centre = world.centre[index] - middle
-            along = (to_centre * towards).sum(-1) / (towards * towards).sum(-1)
-            along = np.maximum(along, 0) if sun else np.clip(along, 0, 1)
-            gap = np.linalg.norm(to_centre - along[:, None] * towards, axis=-1)
-            rows = used[gap < radius[index] + reach]
+        for column, index in enumerate(blockers):
+            rows = used[near_beam[:, column]]
             if not len(rows):
                 continue
             turn, centre = world.rotation[index], world.centre[index]

@@ -156,38 +156,46 @@ def surface_at(
     )  # fmt: skip
 
 
+_SIDE = (SIZE >> np.arange(LEVELS)).astype(np.int64)
+_SIDE_FLOAT = _SIDE.astype(np.float32)
+
+
 def _bilinear(
     texels: NDArray[np.uint8], start: NDArray[np.int64], level: NDArray[np.int64], u: Array, v: Array
 ) -> Array:
-    """Wrapped bilinear sample of one mip level per ray: (N,3) in 0..255."""
-    side = (SIZE >> level).astype(np.int64)
+    """Wrapped bilinear sample of one mip level per ray: (3,N) in 0..255."""
+    side, extent = _SIDE[level], _SIDE_FLOAT[level]
     first = start + LEVEL_START[level]
-    x, y = u * side - np.float32(0.5), v * side - np.float32(0.5)
+    x, y = u * extent - np.float32(0.5), v * extent - np.float32(0.5)
     column, row = np.floor(x), np.floor(y)
-    fx, fy = (x - column).astype(np.float32)[:, None], (y - row).astype(np.float32)[:, None]
+    fx, fy = x - column, y - row
     mask = side - 1
     left, top = column.astype(np.int64) & mask, row.astype(np.int64) & mask
     right, bottom = (left + 1) & mask, first + ((top + 1) & mask) * side
     top = first + top * side
-    upper = np.take(texels, top + left, axis=0) * (1 - fx) + np.take(texels, top + right, axis=0) * fx
-    lower = np.take(texels, bottom + left, axis=0) * (1 - fx) + np.take(texels, bottom + right, axis=0) * fx
-    return upper * (1 - fy) + lower * fy
+    corners = (top + left, top + right, bottom + left, bottom + right)
+    shares = ((1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy)
+    result = np.zeros((3, len(u)), dtype=np.float32)
+    for corner, share in zip(corners, shares, strict=True):
+        for k in range(3):
+            result[k] += np.take(texels[k], corner) * share
+    return result
 
 
 def sample_texture(
     texels: NDArray[np.uint8], start: NDArray[np.int64], u: Array, v: Array, texels_per_ray: Array
 ) -> Array:
-    """Trilinear weights (N,3) in [0,1]: ``u, v`` in repeats, ``texels_per_ray`` the footprint in finest texels."""
-    level = np.clip(np.log2(np.maximum(texels_per_ray, np.float32(1e-6))), 0, LEVELS - 1.001)
+    """Trilinear weights (3,N) in [0,1]: ``u, v`` in repeats, ``texels_per_ray`` the footprint in finest texels."""
+    level = np.clip(np.log2(np.maximum(texels_per_ray, np.float32(1e-6))), 0, LEVELS - 1.001).astype(np.float32)
     base = level.astype(np.int64)
-    blend = (level - base).astype(np.float32)[:, None]
+    blend = level - base.astype(np.float32)
     result = _bilinear(texels, start, base, u, v)
-    # Magnified or exactly matching texels need one level only.
-    coarse = np.nonzero(blend[:, 0] > 0)[0]
+    # Magnified textures need one level only; a blend under 2 % cannot be seen.
+    coarse = np.flatnonzero(blend > 0.02)
     if len(coarse):
         weight = blend[coarse]
         next_level = _bilinear(texels, start[coarse], base[coarse] + 1, u[coarse], v[coarse])
-        result[coarse] = result[coarse] * (1 - weight) + next_level * weight
+        result[:, coarse] += (next_level - result[:, coarse]) * weight
     return result * np.float32(1 / 255)
 
 
@@ -203,7 +211,7 @@ def _sky_radiance(world: World, direction: list[Array]) -> Array:
         flat = np.maximum(up, np.float32(0.02)) + np.float32(0.15)
         u, v = direction[0] / length / flat * np.float32(0.2), direction[1] / length / flat * np.float32(0.2)
         zero = np.zeros(len(u), dtype=np.int64)
-        cover = sample_texture(world.sky_texels, zero, u, v, np.full(len(u), 2.0, np.float32))[:, 1:2]
+        cover = sample_texture(world.sky_texels, zero, u, v, np.full(len(u), 2.0, np.float32))[1][:, None]
         cover = cover * np.float32(world.sky.clouds) * np.clip(up * 6, 0, 1)[:, None]
         colour = colour * (1 - cover) + np.float32(0.95) * cover
     return colour.astype(np.float32)
@@ -216,38 +224,44 @@ def shade(world: World, surface: Surface, light: list[Array], open_share: Array 
         light: direct irradiance per channel. open_share: ambient visibility, or None for the closed form in room corners.
         focal_px: of the image that ``surface`` samples; sets the texture footprint.
     """
-    hit = np.nonzero(surface.primitive >= 0)
-    primitive = surface.primitive[hit]
-    material = world.face_material[primitive, surface.face[hit]]
-    u, v = surface.u[hit], surface.v[hit]
+    flat_primitive = surface.primitive.ravel()
+    hit = np.flatnonzero(flat_primitive >= 0)
+    complete = len(hit) == flat_primitive.size
+
+    def at_hits(values: Array) -> Array:
+        return values.ravel() if complete else values.ravel()[hit]
+
+    primitive = at_hits(surface.primitive)
+    material = world.face_material[primitive, at_hits(surface.face)]
+    u, v = at_hits(surface.u), at_hits(surface.v)
     rate = world.repeats_per_m[material]
     fit = rate == 0
-    rate_u, rate_v = np.where(fit, 1 / surface.size_u[hit], rate), np.where(fit, 1 / surface.size_v[hit], rate)
-    u, v = u * rate_u + np.where(fit, np.float32(0.5), 0), v * rate_v + np.where(fit, np.float32(0.5), 0)
+    middle = np.where(fit, np.float32(0.5), np.float32(0))
+    rate_u = np.where(fit, 1 / at_hits(surface.size_u), rate)
+    rate_v = np.where(fit, 1 / at_hits(surface.size_v), rate)
+    u, v = u * rate_u + middle, v * rate_v + middle
     turned = world.turned[material]
-    u, v = np.where(turned, v, u) + world.offset[material, 0], np.where(turned, u, v) + world.offset[material, 1]
-    direction = [d[hit] for d in surface.direction]
-    normal = [n[hit] for n in surface.normals]
+    u, v = np.where(turned, v, u) + world.offset[:, 0][material], np.where(turned, u, v) + world.offset[:, 1][material]
+    direction = [at_hits(d) for d in surface.direction]
+    normal = [at_hits(n) for n in surface.normals]
     length = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
     cosine = -(normal[0] * direction[0] + normal[1] * direction[1] + normal[2] * direction[2]) / length
-    footprint = surface.depth[hit] / np.float32(focal_px) / np.sqrt(np.maximum(cosine, np.float32(0.02)))
-    texels = footprint * np.maximum(rate_u, rate_v) * SIZE
-    weights = sample_texture(
-        world.texels, world.texture_start[material], u.astype(np.float32), v.astype(np.float32), texels
-    )
-    matrix = world.colour_matrix
+    footprint = at_hits(surface.depth) / np.float32(focal_px) / np.sqrt(np.maximum(cosine, np.float32(0.02)))
+    texels = footprint * np.maximum(rate_u, rate_v) * np.float32(SIZE)
+    weights = sample_texture(world.texels, world.texture_start[material], u, v, texels)
     up = (normal[2] + 1) * np.float32(0.5)
     if open_share is None:
-        visible = 1 - np.float32(0.3) * np.exp(-surface.edge[hit] / np.float32(0.35))
+        visible = 1 - np.float32(0.3) * np.exp(at_hits(surface.edge) * np.float32(-1 / 0.35))
     else:
-        visible = open_share[hit]
+        visible = at_hits(open_share)
     emission = world.emission[material]
-    result = np.empty((*surface.primitive.shape, 3), dtype=np.float32)
+    result = np.empty((flat_primitive.size, 3), dtype=np.float32)
     for k in range(3):
-        albedo = sum(weights[:, j] * matrix[:, k, j][material] for j in range(3))
+        columns = [np.ascontiguousarray(world.colour_matrix[:, k, j])[material] for j in range(3)]
+        albedo = weights[0] * columns[0] + weights[1] * columns[1] + weights[2] * columns[2]
         ambient = (world.ambient[0, k] + (world.ambient[1, k] - world.ambient[0, k]) * up) * visible
-        result[..., k][hit] = albedo * (light[k][hit] + ambient + emission)
-    empty = np.nonzero(surface.primitive < 0)
-    if len(empty[0]):
-        result[empty] = _sky_radiance(world, [d[empty] for d in surface.direction])
-    return result
+        result[hit, k] = albedo * (at_hits(light[k]) + ambient + emission)
+    if not complete:
+        empty = np.flatnonzero(flat_primitive < 0)
+        result[empty] = _sky_radiance(world, [d.ravel()[empty] for d in surface.direction])
+    return result.reshape(*surface.primitive.shape, 3)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import zlib
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sceneexpander.synthetic.pictures import PICTURE_FAMILIES
 
-Map = NDArray[np.float32]
+Map = NDArray[Any]  # float32
 Split = Literal["train", "test"]
 
 SIZE = 256
@@ -315,9 +315,8 @@ def packed_texture(key: TextureKey) -> NDArray[np.uint8]:
     packed = []
     for _ in range(LEVELS):
         packed.append(level.reshape(-1, 3))
-        half = level.shape[0] // 2
-        if half:
-            level = level.reshape(half, 2, half, 2, 3).mean(axis=(1, 3))
+        if len(level) > 1:
+            level = (level[0::2, 0::2] + level[0::2, 1::2] + level[1::2, 0::2] + level[1::2, 1::2]) / np.float32(4)
     result = np.round(np.concatenate(packed) * 255).astype(np.uint8)
     result.setflags(write=False)
     return result

@@ -215,7 +215,7 @@ def _lonely_view(
 ) -> Pose | None:
     """A pose that shares less than 2 % with every given one."""
     for _ in range(8):
-        eye = rng.uniform(*world.bounds.astype(np.float64))
+        eye = rng.uniform(world.bounds[0].astype(np.float64), world.bounds[1].astype(np.float64))
         away = poses[0, :3, 2]
         yaw = float(np.arctan2(-away[1], -away[0]) + rng.normal(0, 0.5))
         pose = pose_from_angles(eye, yaw, float(rng.normal(0, 0.05)), 0.0)

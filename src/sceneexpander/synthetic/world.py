@@ -78,7 +78,7 @@ class World:
         object_id: (P,) which object (a table, a wall, ...) the primitive belongs to.
         object_names: name per object id.
         casts_shadow: (P,) whether the primitive blocks light.
-        texels: (texel,3) uint8, all packed mip pyramids one after the other.
+        texels: (3,texel) uint8 planes, all packed mip pyramids one after the other.
         texture_start: (M,) first texel of each material's pyramid.
         colour_matrix: (M,3,3) linear albedo from texture weights.
         repeats_per_m, emission, offset, turned: per material.
@@ -203,7 +203,7 @@ class WorldBuilder:
             object_id=np.array(objects, dtype=np.int64),
             object_names=tuple(self._objects),
             casts_shadow=np.array(shadow, dtype=np.bool_),
-            texels=np.concatenate(packs),
+            texels=np.ascontiguousarray(np.concatenate(packs).T),
             texture_start=np.array([starts[material.texture] for material in materials], dtype=np.int64),
             colour_matrix=(colours**2.2).transpose(0, 2, 1).astype(np.float32),
             repeats_per_m=np.array([material.repeats_per_m for material in materials], dtype=np.float32),
@@ -213,7 +213,7 @@ class WorldBuilder:
             lights=tuple(self.lights),
             ambient=np.array(self.ambient, dtype=np.float32),
             sky=self.sky,
-            sky_texels=packed_texture((self.sky or Sky()).texture),
+            sky_texels=np.ascontiguousarray(packed_texture((self.sky or Sky()).texture).T),
             bounds=np.array(self.bounds, dtype=np.float32),
             focus=np.array(self.focus or [(0.0, 0.0, 1.0)], dtype=np.float32),
         )
