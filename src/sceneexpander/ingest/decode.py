@@ -187,7 +187,7 @@ def _open(data: bytes, file_format: str, where: str | Path, max_megapixels: floa
         raise UserError(
             f"has {image.width} x {image.height} pixels ({megapixels:.0f} MP), more than the {max_megapixels:g} MP allowed",
             where=where,
-            fix="scale it down or raise ingest.max_megapixels",
+            fix="scale it down or raise max_megapixels",
         )
     return image
 

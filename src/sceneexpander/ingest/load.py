@@ -16,15 +16,15 @@ from torch import Tensor
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.errors import UserError, did_you_mean
-from sceneexpander.ingest.config import Fit, IngestConfig
+from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.decode import Picture, Pixels, read_picture, read_picture_shape
-from sceneexpander.ingest.fit import FrameSize, common_frame, fit_picture
+from sceneexpander.ingest.fit import FittedPicture, common_frame, fit_picture
 from sceneexpander.ingest.listing import list_pictures, require_inside, safe_name
 from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file
 
 logger = logging.getLogger(__name__)
 
-_LITTLE_KEPT = 0.6
+LITTLE_KEPT = 0.6  # share of a picture's area: losing more than the rest is worth a remark
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +98,10 @@ def read_views(paths: Sequence[Path], config: IngestConfig) -> LoadedViews:
             notes.append(f"{picture.name}: shows the same pixels as {first_name}, left out")
             continue
         view_id = f"{len(parts):03d}_{safe_name(Path(picture.name).stem)}"
-        parts.append(view_from_picture(picture, frame, config.fit, view_id=view_id, notes=notes))
+        fitted = fit_picture(picture.pixels, frame, config.fit)
+        if fitted.kept < LITTLE_KEPT:
+            notes.append(f"{picture.name}: only {fitted.kept:.0%} of it fits the frame of the first view")
+        parts.append(view_from_fitted(picture, fitted, view_id=view_id))
         scale = parts[-1].records[0].stored_from_original[0][0]
         focals.append(None if picture.exif_focal_px is None else picture.exif_focal_px * scale)
     _check_count(len(parts), paths, config, distinct=" different")
@@ -108,13 +111,10 @@ def read_views(paths: Sequence[Path], config: IngestConfig) -> LoadedViews:
     return LoadedViews(views=views, exif_focal_px=tuple(focals), notes=tuple(notes))
 
 
-def view_from_picture(
-    picture: Picture, frame: FrameSize, fit: Fit, *, view_id: str, notes: list[str] | None = None
+def view_from_fitted(
+    picture: Picture, fitted: FittedPicture, *, view_id: str, generated: bool = False, round_number: int = 0
 ) -> ViewSet:
-    """One decoded picture as a set of one captured view in the common frame; remarks are appended to ``notes``."""
-    fitted = fit_picture(picture.pixels, frame, fit)
-    if notes is not None and fitted.kept < _LITTLE_KEPT:
-        notes.append(f"{picture.name}: only {fitted.kept:.0%} of it fits the frame of the first view")
+    """A decoded picture and its fit to the common frame as a set of one view."""
     record = ViewRecord(
         view_id=view_id,
         name=picture.name,
@@ -122,6 +122,8 @@ def view_from_picture(
         original_width=picture.width,
         sha256=picture.sha256,
         stored_from_original=fitted.stored_from_original,
+        generated=generated,
+        round=round_number,
     )
     return ViewSet(
         records=(record,), images=image_tensor(fitted.image)[None], detail_images=image_tensor(fitted.detail)[None]
@@ -163,7 +165,7 @@ def _check_count(count: int, paths: Sequence[Path], config: IngestConfig, *, dis
         raise UserError(
             f"holds {count} pictures, more than the {config.max_views} allowed",
             where=where,
-            fix="remove some or raise ingest.max_views",
+            fix="remove some or raise max_views",
         )
 
 
