@@ -1,0 +1,274 @@
+"""``python -m sceneexpander.convert_checkpoint IN.pt OUT.safetensors``: PyTorch checkpoints without running their code.
+
+A ``.pt``/``.pth``/``.ckpt``/``.bin`` file is a zip archive with a pickle, and a pickle is a program. This reader never hands it to
+``torch.load``: its own unpickler knows a closed list of names (tensor rebuilding, storages, ordered dictionaries), all of them bound to
+functions of this module, and refuses every other name before anything is called. So no checkpoint can run code here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import math
+import os
+import pickle
+import sys
+import uuid
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from sceneexpander.errors import UserError, entry_point
+
+MAX_PICKLE_BYTES = 64 << 20  # names and shapes only; the numbers live outside the pickle
+STORAGE_DTYPES = {
+    "FloatStorage": torch.float32,
+    "DoubleStorage": torch.float64,
+    "HalfStorage": torch.float16,
+    "BFloat16Storage": torch.bfloat16,
+    "LongStorage": torch.int64,
+    "IntStorage": torch.int32,
+    "ShortStorage": torch.int16,
+    "CharStorage": torch.int8,
+    "ByteStorage": torch.uint8,
+    "BoolStorage": torch.bool,
+}
+STATE_DICT_KEYS = ("state_dict", "model_state_dict", "model")  # where training scripts put the weights
+
+
+class RefusedPickleError(Exception):
+    """The pickle asks for something that is not on the list."""
+
+
+class _Sealed:
+    """An object that a pickle may hold and pass on, but not change."""
+
+    def __setstate__(self, state: object) -> None:
+        raise RefusedPickleError(f"it tries to change a {type(self).__name__.strip('_').lower()}")
+
+
+class _StorageKind(_Sealed):
+    """Stands for a storage class; not callable, so a pickle cannot construct anything from it."""
+
+    def __init__(self, dtype: torch.dtype) -> None:
+        self.dtype = dtype
+
+
+class _Storage(_Sealed):
+    """A flat run of numbers."""
+
+    def __init__(self, values: Tensor) -> None:
+        self.values = values
+
+
+class _View(_Sealed):
+    """A tensor that the pickle describes, with every index checked."""
+
+    def __init__(self, values: Tensor) -> None:
+        self.values = values
+
+
+class _Entries(OrderedDict[object, object]):
+    """The ordered dictionary of a state dict; module metadata that hangs on it is dropped."""
+
+    def __setstate__(self, state: object) -> None:
+        return
+
+
+class _Function(_Sealed):
+    """A function under the name of the PyTorch function that it replaces."""
+
+    def __init__(self, function: Callable[..., object]) -> None:
+        self.function = function
+
+    def __call__(self, *args: object) -> object:
+        return self.function(*args)
+
+
+class _Archive:
+    """The storages of a checkpoint's zip archive."""
+
+    def __init__(self, archive: zipfile.ZipFile, prefix: str) -> None:
+        self.archive = archive
+        self.prefix = prefix
+        self.storages: dict[str, _Storage] = {}
+
+    def storage(self, dtype: torch.dtype, key: str, count: int) -> _Storage:
+        """The storage of that key; read once, because tensors may share it."""
+        if key in self.storages:
+            return self.storages[key]
+        try:
+            entry = self.archive.getinfo(f"{self.prefix}data/{key}")
+        except KeyError:
+            raise RefusedPickleError(f"storage {key!r} is missing") from None
+        item = torch.empty(0, dtype=dtype).element_size()
+        # PyTorch stores uncompressed; a compressed entry would be a way to a bomb.
+        if entry.compress_type != zipfile.ZIP_STORED or entry.file_size != count * item:
+            raise RefusedPickleError(
+                f"storage {key!r} has {entry.file_size} bytes, expected {count * item} uncompressed"
+            )
+        raw = bytearray(self.archive.read(entry))
+        values = torch.frombuffer(raw, dtype=dtype) if count else torch.empty(0, dtype=dtype)
+        self.storages[key] = _Storage(values)
+        return self.storages[key]
+
+
+def _rebuild_tensor(storage: object, offset: object, size: object, stride: object, *_ignored: object) -> _View:
+    """A view of a storage; gradient flags and hooks are ignored."""
+    if not isinstance(storage, _Storage) or not isinstance(size, tuple) or not isinstance(stride, tuple):
+        raise RefusedPickleError("a tensor is not built from a storage")
+    numbers = (offset, *size, *stride)
+    if (
+        not isinstance(offset, int)
+        or len(size) != len(stride)
+        or not all(isinstance(n, int) and n >= 0 for n in numbers)
+    ):
+        raise RefusedPickleError(f"a tensor has offset {offset}, size {size} and stride {stride}")
+    available, count = storage.values.numel(), math.prod(size)
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    # The count too: with strides of 0 a small file could claim any amount of memory once copied.
+    if count and (last >= available or count > available):
+        raise RefusedPickleError(f"a tensor of size {size} reaches element {last} of a storage of {available}")
+    return _View(torch.as_strided(storage.values, size, stride, offset))
+
+
+def _rebuild_parameter(data: object, *_ignored: object) -> _View:
+    if not isinstance(data, _View):
+        raise RefusedPickleError("a parameter is not built from a tensor")
+    return data
+
+
+ALLOWED: dict[tuple[str, str], object] = {
+    ("collections", "OrderedDict"): _Entries,
+    ("torch._utils", "_rebuild_tensor_v2"): _Function(_rebuild_tensor),
+    ("torch._utils", "_rebuild_parameter"): _Function(_rebuild_parameter),
+    **{("torch", name): _StorageKind(dtype) for name, dtype in STORAGE_DTYPES.items()},
+}
+
+
+class _Unpickler(pickle.Unpickler):
+    """Looks names up in `ALLOWED` and nowhere else: no module is ever imported for a pickle."""
+
+    def __init__(self, data: bytes, archive: _Archive) -> None:
+        super().__init__(io.BytesIO(data))
+        self.archive = archive
+
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return ALLOWED[module, name]
+        except KeyError:
+            raise RefusedPickleError(f"it asks for {module}.{name}, which is not allowed") from None
+
+    def persistent_load(self, pid: object) -> _Storage:
+        match pid:
+            case ("storage", _StorageKind() as kind, str(key), str(), int(count)) if count >= 0:
+                return self.archive.storage(kind.dtype, key, count)
+        raise RefusedPickleError("it holds a reference that is not a storage")
+
+
+def read_checkpoint(path: Path, *, key: str | None = None) -> dict[str, Tensor]:
+    """Tensors by name, from a zip-format PyTorch checkpoint.
+
+    Args:
+        path: the checkpoint.
+        key: entry of the top-level dictionary that holds the weights; by default the dictionary itself if it holds tensors,
+            otherwise the first of ``state_dict``, ``model_state_dict``, ``model``.
+
+    Raises:
+        UserError: not a zip-format checkpoint, truncated, or a pickle that asks for anything but plain tensors.
+    """
+    if not path.is_file():
+        raise UserError("does not exist" if not path.exists() else "is not a file", where=path, fix="check the path")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            content = _unpickle(archive)
+    except zipfile.BadZipFile:
+        fix = "re-save checkpoints of the old (non-zip) format with a current PyTorch, on a machine you can spare"
+        raise UserError("is not a zip-format PyTorch checkpoint, or is truncated", where=path, fix=fix) from None
+    except RefusedPickleError as error:
+        fix = "only checkpoints of plain tensors are converted; ask its author for safetensors"
+        raise UserError(f"is refused: {error}", where=path, fix=fix) from None
+    except (pickle.UnpicklingError, EOFError, OSError, MemoryError, RuntimeError, NotImplementedError) as error:
+        raise UserError(f"is damaged ({error or type(error).__name__})", where=path, fix="fetch it again") from None
+    except (ValueError, TypeError, AttributeError, IndexError, KeyError, OverflowError) as error:
+        # What a hand-made pickle provokes inside the unpickler; the list above is what a broken file does.
+        raise UserError(f"holds a malformed pickle ({type(error).__name__}: {error})", where=path) from None
+    return _weights_of(content, path, key)
+
+
+def _unpickle(archive: zipfile.ZipFile) -> object:
+    names = [name for name in archive.namelist() if name == "data.pkl" or name.endswith("/data.pkl")]
+    if len(names) != 1:
+        raise RefusedPickleError(f"it has {len(names)} data.pkl entries, expected 1")
+    prefix = names[0].removesuffix("data.pkl")
+    if f"{prefix}byteorder" in archive.namelist() and archive.read(f"{prefix}byteorder") != b"little":
+        raise RefusedPickleError("its numbers are not little-endian")
+    if archive.getinfo(names[0]).file_size > MAX_PICKLE_BYTES:
+        raise RefusedPickleError(f"its pickle is larger than {MAX_PICKLE_BYTES} bytes")
+    return _Unpickler(archive.read(names[0]), _Archive(archive, prefix)).load()
+
+
+def _weights_of(content: object, path: Path, key: str | None) -> dict[str, Tensor]:
+    if isinstance(content, dict):
+        keys: Sequence[str | None] = [key] if key is not None else [None, *STATE_DICT_KEYS]
+        for candidate in keys:
+            found = content if candidate is None else content.get(candidate)
+            if isinstance(found, dict):
+                tensors = {
+                    n: view.values for n, view in found.items() if isinstance(n, str) and isinstance(view, _View)
+                }
+                if tensors:
+                    return tensors
+        there = ", ".join(str(name) for name in list(content)[:5])
+        raise UserError(f"has no dictionary of tensors (its entries: {there})", where=path, fix="name it with --key")
+    raise UserError(f"holds a {type(content).__name__}, not a dictionary of tensors", where=path)
+
+
+def convert(source: Path, target: Path, *, key: str | None = None) -> int:
+    """Write the checkpoint's tensors as safetensors, atomically; returns how many.
+
+    Raises:
+        UserError: see `read_checkpoint`, or if the target has another suffix.
+    """
+    if target.suffix != ".safetensors":
+        raise UserError("must end in .safetensors", where=target, fix="choose another output name")
+    tensors = read_checkpoint(source, key=key)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        # Clones: safetensors refuses tensors that share memory.
+        save_file(
+            {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}, scratch
+        )
+        with scratch.open("rb") as file:
+            os.fsync(file.fileno())
+        scratch.replace(target)
+    finally:
+        scratch.unlink(missing_ok=True)
+    return len(tensors)
+
+
+@entry_point
+def main(arguments: list[str] | None = None) -> int:
+    """Convert one file."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sceneexpander.convert_checkpoint",
+        description="Convert a PyTorch checkpoint of plain tensors to safetensors without running any code in it.",
+    )
+    parser.add_argument("source", type=Path, help=".pt, .pth, .ckpt or .bin file")
+    parser.add_argument("target", type=Path, help=".safetensors file to write")
+    parser.add_argument("--key", help="entry of the checkpoint that holds the weights (default: found automatically)")
+    options = parser.parse_args(arguments)
+    count = convert(options.source, options.target, key=options.key)
+    print(f"{count} tensors -> {options.target}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
