@@ -1,0 +1,116 @@
+"""Mutual nearest neighbours with a ratio test, and matching again inside a known epipolar band."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sceneexpander.frontend.features import Features
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Matches:
+    """M correspondences between two views; each feature occurs at most once. ``ratio`` in [0, 1], smaller is surer."""
+
+    index_a: Int[np.ndarray, " match"]
+    index_b: Int[np.ndarray, " match"]
+    ratio: Float[np.ndarray, " match"]
+
+    @property
+    def count(self) -> int:
+        """Number of correspondences."""
+        return int(self.index_a.shape[0])
+
+    def select(self, keep: np.ndarray) -> Matches:
+        """The subset given by a boolean mask or an index array."""
+        return Matches(index_a=self.index_a[keep], index_b=self.index_b[keep], ratio=self.ratio[keep])
+
+    @classmethod
+    def empty(cls) -> Matches:
+        """No correspondences."""
+        none = np.zeros(0, np.int64)
+        return cls(index_a=none, index_b=none, ratio=np.zeros(0))
+
+
+def similarity(a: Features, b: Features) -> Float[np.ndarray, "feature_a feature_b"]:
+    """Cosine similarity of all descriptor pairs, float32."""
+    return a.descriptors @ b.descriptors.T
+
+
+def mutual_matches(scores: Float[np.ndarray, "feature_a feature_b"], max_ratio: float) -> Matches:
+    """Mutual nearest neighbours whose distance ratio to the second nearest is at most ``max_ratio`` in both directions."""
+    if min(scores.shape) < 2:
+        return Matches.empty()
+    columns = np.ascontiguousarray(scores.T)  # reductions along the contiguous axis are several times faster
+    b_of_a, a_of_b = scores.argmax(1), columns.argmax(1)
+    index_a = np.flatnonzero(a_of_b[b_of_a] == np.arange(len(scores)))
+    index_b = b_of_a[index_a]
+    best = scores[index_a, index_b]
+    rival = np.maximum(_best_other(scores[index_a], index_b), _best_other(columns[index_b], index_a))
+    ratio = descriptor_distance(best) / np.maximum(descriptor_distance(rival), 1e-6)
+    keep = ratio <= max_ratio
+    return Matches(index_a=index_a[keep], index_b=index_b[keep], ratio=ratio[keep].astype(np.float64))
+
+
+def guided_matches(
+    scores: Float[np.ndarray, "feature_a feature_b"],
+    a: Features,
+    b: Features,
+    fundamental: Float[np.ndarray, "3 3"],
+    *,
+    band_px: float,
+    max_ratio: float,
+    max_distance: float,
+) -> Matches:
+    """Mutual matches among the candidates within ``band_px`` of each other's epipolar lines (x_b^T F x_a = 0).
+
+    The ratio test then compares only with rivals in the band, which brings back matches that repeat elsewhere in the image.
+    With few rivals that proves little, so descriptors must also be nearer than ``max_distance`` in absolute terms.
+    """
+    index_a, index_b = np.nonzero(scores > 1 - max_distance**2 / 2)
+    points_a = np.concatenate([a.pixel_xy, np.ones((a.count, 1))], 1)
+    points_b = np.concatenate([b.pixel_xy, np.ones((b.count, 1))], 1)
+    lines_b, lines_a = points_a @ fundamental.T, points_b @ fundamental
+    algebraic = np.abs((lines_b[index_a] * points_b[index_b]).sum(1))
+    norm = np.minimum(np.linalg.norm(lines_b[index_a, :2], axis=1), np.linalg.norm(lines_a[index_b, :2], axis=1))
+    inside = algebraic < band_px * norm
+    index_a, index_b = index_a[inside], index_b[inside]
+    value = scores[index_a, index_b]
+    best_a, rival_a = _best_two(index_a, value, a.count)
+    best_b, rival_b = _best_two(index_b, value, b.count)
+    # Candidates are unique pairs, so "is the best of its row and of its column" is mutual nearest neighbour.
+    mutual = (best_a[index_a] == np.arange(len(value))) & (best_b[index_b] == np.arange(len(value)))
+    index_a, index_b, value = index_a[mutual], index_b[mutual], value[mutual]
+    # A rival further than the candidate threshold was never listed: it is at least that far away.
+    rival = np.maximum(np.maximum(rival_a[index_a], rival_b[index_b]), 1 - max_distance**2 / 2)
+    ratio = descriptor_distance(value) / np.maximum(descriptor_distance(rival), 1e-6)
+    keep = ratio <= max_ratio
+    return Matches(index_a=index_a[keep], index_b=index_b[keep], ratio=ratio[keep].astype(np.float64))
+
+
+def descriptor_distance(cosine: np.ndarray) -> np.ndarray:
+    """Euclidean distance of unit descriptors."""
+    return np.sqrt(np.maximum(2 - 2 * cosine, 0.0))
+
+
+def _best_other(rows: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """Largest entry per row when column ``best`` is left out (``rows`` is overwritten)."""
+    rows[np.arange(len(rows)), best] = -1.0
+    return rows.max(1) if len(rows) else np.zeros(0, rows.dtype)
+
+
+def _best_two(group: np.ndarray, value: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
+    """Per group: position of its largest value (-1 if empty) and its second largest value (-1 if none)."""
+    order = np.lexsort((-value, group))
+    sorted_group = group[order]
+    first = np.ones(len(order), bool)
+    first[1:] = sorted_group[1:] != sorted_group[:-1]
+    best = np.full(groups, -1, np.int64)
+    best[sorted_group[first]] = order[first]
+    second = np.zeros(len(order), bool)
+    second[1:] = first[:-1] & ~first[1:]
+    rival = np.full(groups, -1.0, np.float64)
+    rival[sorted_group[second]] = value[order[second]]
+    return best, rival

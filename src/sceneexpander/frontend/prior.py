@@ -1,0 +1,80 @@
+"""The whole geometric front-end: photos -> cameras, dense depth and evidence, in one frame and one scale."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.frontend.dense import DenseConfig, dense_depth
+from sceneexpander.frontend.sfm import estimate_cameras
+from sceneexpander.frontend.sfm_types import SfmConfig, SparseReconstruction
+from sceneexpander.geometry.priors import Priors
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrontendConfig:
+    """Constants of both halves of the front-end."""
+
+    sfm: SfmConfig = field(default_factory=SfmConfig)
+    dense: DenseConfig = field(default_factory=DenseConfig)
+
+
+def build_priors(
+    images: Float[Tensor, "view 3 height width"],
+    config: FrontendConfig,
+    *,
+    generator: torch.Generator,
+    feature_images: Float[Tensor, "view 3 feature_height feature_width"] | None = None,
+    known_intrinsics_px: Float[Tensor, "view 3 3"] | None = None,
+    known_world_from_cam: Float[Tensor, "view 4 4"] | None = None,
+    focal_hint_px: float | None = None,
+    names: Sequence[str] | None = None,
+) -> tuple[Priors, SparseReconstruction]:
+    """Everything a reconstructor can be told about S >= 1 views; arguments as in `sfm.estimate_cameras`.
+
+    World frame: view 0's camera. Scale: the median of view 0's dense depth is 1, for poses, points and depth together.
+    """
+    sparse = estimate_cameras(
+        images,
+        config.sfm,
+        generator=generator,
+        feature_images=feature_images,
+        known_intrinsics_px=known_intrinsics_px,
+        known_world_from_cam=known_world_from_cam,
+        focal_hint_px=focal_hint_px,
+        names=names,
+    )
+    dense = dense_depth(
+        images.cpu(),
+        sparse.world_from_cam,
+        sparse.intrinsics_px,
+        sparse.sparse,
+        config.dense,
+        posed=sparse.posed,
+    )
+    scale = 1.0 / float(dense.depth[0].median())
+    sparse = rescaled(sparse, scale)
+    priors = Priors(
+        world_from_cam=sparse.world_from_cam,
+        intrinsics_px=sparse.intrinsics_px,
+        depth=dense.depth * scale,
+        evidence=dense.evidence,
+        posed=sparse.posed,
+    )
+    return priors, sparse
+
+
+def rescaled(reconstruction: SparseReconstruction, scale: float) -> SparseReconstruction:
+    """The same reconstruction with every length multiplied by ``scale``."""
+    world_from_cam = reconstruction.world_from_cam.clone()
+    world_from_cam[:, :3, 3] *= scale
+    return replace(
+        reconstruction,
+        world_from_cam=world_from_cam,
+        sparse=replace(reconstruction.sparse, points_world=reconstruction.sparse.points_world * scale),
+        report=replace(reconstruction.report, scale=reconstruction.report.scale * scale),
+    )

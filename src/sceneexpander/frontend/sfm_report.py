@@ -1,0 +1,134 @@
+"""From a finished mapping to the result other rooms see: view 0's frame, unit scale, pixels of the given images, report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from sceneexpander.frontend.features import Features
+from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.placement import Placement
+from sceneexpander.frontend.sfm_types import FocalSource, PairReport, SfmReport, SparseReconstruction, ViewReport
+from sceneexpander.frontend.sparse_points import SparsePoints
+
+
+def build_reconstruction(
+    mapping: Mapping,
+    placed: dict[int, Placement],
+    features: Sequence[Features],
+    pairs: tuple[PairReport, ...],
+    focal_source: FocalSource,
+    names: Sequence[str],
+    scale_xy: np.ndarray,
+) -> SparseReconstruction:
+    """Change frame, scale and pixels; write the report.
+
+    Args:
+        mapping: finished model; every view has some pose in it.
+        placed: how the views outside the adjusted model were posed.
+        features: of all views.
+        pairs: for the report.
+        focal_source: for the report.
+        names: of the views.
+        scale_xy: pixels of the given images per pixel of the feature images.
+    """
+    world_from_cam, points, scale = _normalised(mapping)
+    rows, views = np.nonzero(mapping.active & mapping.registered)
+    used = np.flatnonzero(mapping.valid)
+    position = np.full(mapping.tracks.count, -1)
+    position[used] = np.arange(len(used))
+    sparse = SparsePoints(
+        points_world=torch.from_numpy(points[used].astype(np.float32)),
+        view_index=torch.from_numpy(views.astype(np.int64)),
+        point_index=torch.from_numpy(position[rows].astype(np.int64)),
+        pixel_xy=torch.from_numpy((mapping.tracks.pixel_xy[rows, views] * scale_xy).astype(np.float32)),
+    )
+    intrinsics = mapping.intrinsics * np.array([scale_xy[0], scale_xy[1], 1.0])[:, None]
+    posed = mapping.registered.copy()
+    for view, how in placed.items():
+        posed[view] = how.loose
+    errors = np.where(mapping.active & mapping.registered, mapping.errors_px(), np.nan) * float(scale_xy.mean())
+    angles = mapping.angles_deg()[used]
+    report = SfmReport(
+        views=tuple(_view_report(v, names[v], mapping, placed.get(v), features, errors) for v in range(len(names))),
+        pairs=pairs,
+        focal_px=float(intrinsics[0, 0, 0]),
+        focal_ratio=float(mapping.intrinsics[0, 0, 0]) / (mapping.unit_px * 768),
+        focal_source=focal_source,
+        focal_sigma=float(mapping.focal_sigma),
+        points=len(used),
+        median_angle_deg=float(np.median(angles)) if len(used) else float("nan"),
+        mean_error_px=float(np.nanmean(errors)) if len(rows) else float("nan"),
+        scale=scale,
+        notes=_notes(mapping, focal_source),
+    )
+    return SparseReconstruction(
+        world_from_cam=torch.from_numpy(world_from_cam.astype(np.float32)),
+        intrinsics_px=torch.from_numpy(intrinsics.astype(np.float32)),
+        posed=torch.from_numpy(posed),
+        sparse=sparse,
+        report=report,
+    )
+
+
+def _normalised(mapping: Mapping) -> tuple[np.ndarray, np.ndarray, float]:
+    """(world_from_cam, points, scale): view 0's camera frame, median depth of the points it sees 1."""
+    first_rotation, first_translation = mapping.rotations[0], mapping.translations[0]
+    points = mapping.points @ first_rotation.T + first_translation
+    rotations = mapping.rotations @ first_rotation.T  # cam_from_view0
+    translations = mapping.translations - rotations @ first_translation
+    depths = [
+        (points[rows] @ rotations[view].T + translations[view])[:, 2]
+        for view in np.flatnonzero(mapping.registered)
+        if len(rows := np.flatnonzero(mapping.active[:, view] & mapping.valid))
+    ]
+    seen_first = np.flatnonzero(mapping.active[:, 0] & mapping.valid) if mapping.registered[0] else []
+    scale = 1.0
+    if len(seen_first):
+        scale = 1.0 / float(np.median(points[seen_first, 2]))
+    elif depths:
+        scale = 1.0 / float(np.median(np.concatenate(depths)))
+    world_from_cam = np.tile(np.eye(4), (len(rotations), 1, 1))
+    world_from_cam[:, :3, :3] = rotations.transpose(0, 2, 1)
+    world_from_cam[:, :3, 3] = -np.einsum("vji,vj->vi", rotations, translations) * scale
+    world_from_cam[0] = np.eye(4)  # exactly, not to rounding
+    return world_from_cam, points * scale, scale
+
+
+def _view_report(
+    view: int,
+    name: str,
+    mapping: Mapping,
+    placement: Placement | None,
+    features: Sequence[Features],
+    errors: np.ndarray,
+) -> ViewReport:
+    """One line of the report."""
+    inliers = int((mapping.active[:, view] & mapping.valid).sum()) if mapping.registered[view] else 0
+    return ViewReport(
+        view=view,
+        name=name,
+        registered=placement is None or placement.loose,
+        loose=placement is not None and placement.loose,
+        reason="" if placement is None else placement.reason,
+        features=features[view].count,
+        inliers=inliers if placement is None else placement.inliers,
+        mean_error_px=float(np.nanmean(errors[:, view])) if inliers else float("nan"),
+        placed_like=None if placement is None else placement.like,
+    )
+
+
+def _notes(mapping: Mapping, source: FocalSource) -> tuple[str, ...]:
+    """What a person should know about the whole set."""
+    notes = []
+    if not mapping.valid.any():
+        notes.append("no point could be triangulated: the views share no matches with parallax")
+    if source is FocalSource.SWEPT:
+        notes.append(
+            "the focal is the best of a few plausible values: too few views or too little evidence to refine it"
+        )
+    if source is FocalSource.ASSUMED:
+        notes.append("the focal is assumed: nothing to estimate it from")
+    return tuple(notes)

@@ -1,0 +1,161 @@
+"""Settings and results of the sparse front-end (`sceneexpander.frontend.sfm`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sceneexpander.frontend.sparse_points import SparsePoints
+
+REFERENCE_LONG_SIDE_PX = 768  # every `_px` threshold below is for images of this long side, and scales with it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SfmConfig:
+    """Constants of the sparse front-end. Thresholds in pixels hold at a long side of 768 px and scale with the images.
+
+    Raises:
+        ValueError: a bound that is empty or a count that cannot work.
+    """
+
+    # Features and matches.
+    max_features: int = 4000  # strongest kept per view
+    contrast_threshold: float = 0.01  # SIFT's default of 0.04 leaves plain rooms with a few hundred features
+    upsample_below_px: int = 700  # images with a shorter long side are enlarged 2x before detection
+    equalise: bool = True  # local contrast equalisation (CLAHE) before detection
+    match_ratio: float = 0.87  # nearest / second nearest distance, both directions, of mutual neighbours
+    loose_match_ratio: float = 0.95  # the same for last-chance registration
+    guided: bool = True  # match again inside the epipolar band of verified pairs
+    guided_band_px: float = 2.0
+    guided_ratio: float = 0.85
+    guided_max_distance: float = 0.7  # of unit descriptors
+
+    # Verification of pairs.
+    epipolar_px: float = 1.5  # MAGSAC noise scale for fundamental, essential and homography models
+    min_pair_inliers: int = 15
+    min_pair_inlier_share: float = 0.12
+    rotation_share: float = 0.85  # rotation-only: a pure rotation explains this share of the verified matches
+    rotation_px: float = 2.5
+
+    # Focal length, in units of the long side.
+    focal_starts: tuple[float, ...] = (0.6, 0.75, 0.9, 1.1, 1.3)
+    focal_bounds: tuple[float, float] = (0.45, 1.6)
+    focal_prior: float = 0.85  # phones .7-.75, 35-50 mm lenses 1-1.4, wide lenses .5-.6
+    focal_prior_sigma: float = 0.25  # of the logarithm
+    focal_hint_sigma: float = 0.05  # of the logarithm, around a focal from EXIF
+    min_views_for_focal: int = 4  # with fewer views the focal is chosen among the starts and then fixed
+    max_focal_sigma: float = 0.15  # of the logarithm: a focal less certain than this is fixed at its start
+
+    # Reconstruction.
+    initial_pairs: int = 2  # tried per focal start
+    sweep_tracks: int = 700  # longest tracks used while choosing focal and initial pair; all of them afterwards
+    max_initial_angle_deg: float = 16.0  # wider angles earn an initial pair nothing more
+    min_angle_deg: float = 0.5  # of the widest pair of rays, for a point to be kept
+    register_px: float = 6.0
+    min_register_inliers: int = 15
+    min_register_share: float = 0.25
+    inlier_px: float = 3.0  # reprojection error of an observation that is kept in the end
+    triangulate_px: float = 5.0  # the same while the model grows
+    robust_px: float = 1.0  # Cauchy scale in bundle adjustment
+    loose_px: float = 8.0  # last-chance registration (views that match only roughly, such as generated ones)
+    min_loose_inliers: int = 10
+    bundle_iterations: int = 40
+    refine_known_poses: bool = False  # True: given poses are a start, not the truth
+    refine_known_intrinsics: bool = False  # True: a shared factor on the given focals is refined
+
+    def __post_init__(self) -> None:
+        low, high = self.focal_bounds
+        if not 0 < low < high:
+            raise ValueError(f"focal_bounds must satisfy 0 < low < high, is {self.focal_bounds}")
+        if not self.focal_starts or any(not low <= start <= high for start in self.focal_starts):
+            raise ValueError(f"focal_starts {self.focal_starts} must lie inside focal_bounds {self.focal_bounds}")
+        if self.min_pair_inliers < 8 or self.min_loose_inliers < 6 or self.min_register_inliers < 6:
+            raise ValueError(
+                "min_pair_inliers must be at least 8, min_register_inliers and min_loose_inliers at least 6"
+            )
+        if not 0 < self.match_ratio <= self.loose_match_ratio <= 1:
+            raise ValueError(f"0 < match_ratio {self.match_ratio} <= loose_match_ratio {self.loose_match_ratio} <= 1")
+
+
+class PairKind(StrEnum):
+    """What the verified matches of two views say about the motion between them."""
+
+    UNRELATED = "unrelated"  # too few matches agree on any geometry
+    PARALLAX = "parallax"  # an essential matrix explains clearly more than a rotation does
+    ROTATION = "rotation"  # a pure rotation explains nearly all matches: no depth from this pair
+
+
+class FocalSource(StrEnum):
+    """Where the focal length came from."""
+
+    KNOWN = "known"  # given intrinsics, kept
+    REFINED = "refined"  # bundle adjustment
+    HINT = "hint"  # given focal, kept
+    SWEPT = "swept"  # the best of the starts, kept because too few views or too little evidence refine it
+    ASSUMED = "assumed"  # nothing to estimate it from: the prior
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairReport:
+    """Matches of one pair of views."""
+
+    view_a: int
+    view_b: int
+    matches: int
+    inliers: int
+    kind: PairKind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewReport:
+    """How one view was posed, or why it was not."""
+
+    view: int
+    name: str
+    registered: bool
+    loose: bool  # registered at the last-chance threshold: trust its pose less
+    reason: str  # empty when registered in the ordinary way
+    features: int
+    inliers: int  # observations of triangulated points
+    mean_error_px: float  # mean reprojection error of those, in pixels of the given images; NaN without any
+    placed_like: int | None  # the view whose pose an unregistered view borrows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SfmReport:
+    """What the sparse front-end found, for people and for logs."""
+
+    views: tuple[ViewReport, ...]
+    pairs: tuple[PairReport, ...]
+    focal_px: float  # of view 0, in pixels of the given images
+    focal_ratio: float  # the same over the long side
+    focal_source: FocalSource
+    focal_sigma: float  # standard deviation of the logarithm by bundle adjustment; NaN if not estimated
+    points: int
+    median_angle_deg: float  # median triangulation angle; NaN without points
+    mean_error_px: float  # NaN without points
+    scale: float  # world units here = given units x scale, for known poses
+    notes: tuple[str, ...]
+
+    @property
+    def registered(self) -> int:
+        """Number of views with an estimated (or given) pose."""
+        return sum(view.registered for view in self.views)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SparseReconstruction:
+    """Cameras and triangulated points of S views.
+
+    World frame: camera frame of view 0. Scale: the median depth of the points seen by view 0 is 1 (over all views if view 0
+    sees none; untouched if there are no points). Poses of views with ``posed`` False are placeholders.
+    """
+
+    world_from_cam: Float[Tensor, "view 4 4"]
+    intrinsics_px: Float[Tensor, "view 3 3"]
+    posed: Bool[Tensor, " view"]
+    sparse: SparsePoints
+    report: SfmReport

@@ -1,0 +1,245 @@
+"""Geometry of one pair of views: verified matches, essential matrix, rotation-only motion.
+
+Points are in pixels, first pixel centre at 0.5. Relative poses are ``b_from_a``: x_b = R x_a + t with |t| = 1.
+Robust fits are OpenCV's USAC with MAGSAC scoring, seeded explicitly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sceneexpander.frontend.features import Features
+from sceneexpander.frontend.matching import Matches, guided_matches, mutual_matches, similarity
+from sceneexpander.frontend.sfm_types import SfmConfig
+
+_ITERATIONS = 4000
+_CONFIDENCE = 0.9999
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairMatches:
+    """Matches of views ``view_a`` < ``view_b``, before and after verification."""
+
+    view_a: int
+    view_b: int
+    loose: Matches  # mutual neighbours at the loose ratio, unverified
+    tentative: int  # how many of those pass the strict ratio
+    verified: Matches  # consistent with one epipolar geometry; empty if the pair is unrelated
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelativePose:
+    """Calibrated motion of a pair."""
+
+    rotation: Float[np.ndarray, "3 3"]  # b_from_a
+    translation: Float[np.ndarray, " 3"]  # b_from_a, unit length
+    inlier: Bool[np.ndarray, " match"]
+    angle_deg: float  # median triangulation angle of the inliers
+
+
+def usac_parameters(threshold: float, seed: int) -> cv2.UsacParams:
+    """Single-threaded MAGSAC with its own random state, so that equal inputs give equal results."""
+    parameters = cv2.UsacParams()
+    parameters.threshold = threshold
+    parameters.confidence = _CONFIDENCE
+    parameters.maxIterations = _ITERATIONS
+    parameters.sampler = cv2.SAMPLING_UNIFORM
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    parameters.isParallel = False
+    parameters.randomGeneratorState = seed
+    return parameters
+
+
+def match_and_verify(
+    view_a: int, view_b: int, features: list[Features], config: SfmConfig, *, unit_px: float, seed: int
+) -> PairMatches:
+    """Match two views and keep what one fundamental matrix explains.
+
+    Args:
+        view_a: index of the first view.
+        view_b: index of the second view.
+        features: of all views.
+        config: ratios and thresholds.
+        unit_px: pixels per pixel at the reference size (thresholds are multiplied by it).
+        seed: of the robust fit.
+    """
+    a, b = features[view_a], features[view_b]
+    if min(a.count, b.count) < 2:
+        return PairMatches(view_a=view_a, view_b=view_b, loose=Matches.empty(), tentative=0, verified=Matches.empty())
+    scores = similarity(a, b)
+    loose = mutual_matches(scores, config.loose_match_ratio)
+    strict = loose.select(loose.ratio <= config.match_ratio)
+    verified = Matches.empty()
+    fit = fit_fundamental(a.pixel_xy[strict.index_a], b.pixel_xy[strict.index_b], config, unit_px=unit_px, seed=seed)
+    if fit is not None:
+        fundamental, inlier = fit
+        verified = strict.select(inlier)
+        if config.guided:
+            guided = guided_matches(
+                scores,
+                a,
+                b,
+                fundamental,
+                band_px=config.guided_band_px * unit_px,
+                max_ratio=config.guided_ratio,
+                max_distance=config.guided_max_distance,
+            )
+            verified = guided if guided.count >= verified.count else verified
+    distinct = distinct_positions(a.pixel_xy[verified.index_a], b.pixel_xy[verified.index_b])
+    return PairMatches(
+        view_a=view_a, view_b=view_b, loose=loose, tentative=strict.count, verified=verified.select(distinct)
+    )
+
+
+def distinct_positions(xy_a: Float[np.ndarray, "match 2"], xy_b: Float[np.ndarray, "match 2"]) -> np.ndarray:
+    """Indices of matches at distinct places: SIFT repeats a keypoint once per dominant orientation."""
+    if len(xy_a) == 0:
+        return np.zeros(0, np.int64)
+    cells = np.rint(np.concatenate([xy_a, xy_b], 1)).astype(np.int64)
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1])
+
+
+def fit_fundamental(
+    xy_a: Float[np.ndarray, "match 2"],
+    xy_b: Float[np.ndarray, "match 2"],
+    config: SfmConfig,
+    *,
+    unit_px: float,
+    seed: int,
+) -> tuple[Float[np.ndarray, "3 3"], Bool[np.ndarray, " match"]] | None:
+    """(F with x_b^T F x_a = 0, inlier mask), or None where chance could explain the agreement."""
+    if len(xy_a) < max(config.min_pair_inliers, 8):
+        return None
+    matrix, mask = cv2.findFundamentalMat(xy_a, xy_b, usac_parameters(config.epipolar_px * unit_px, seed))
+    if matrix is None or mask is None or matrix.shape != (3, 3):
+        return None
+    inlier = mask.ravel().astype(bool)
+    distinct = len(distinct_positions(xy_a[inlier], xy_b[inlier]))
+    # About 7 matches always fit; beyond them a random line band of this width holds a few per cent.
+    if distinct < config.min_pair_inliers or inlier.sum() < 8 + config.min_pair_inlier_share * len(xy_a):
+        return None
+    return matrix, inlier
+
+
+def relative_pose(
+    xy_a: Float[np.ndarray, "match 2"],
+    xy_b: Float[np.ndarray, "match 2"],
+    intrinsics_a: Float[np.ndarray, "3 3"],
+    intrinsics_b: Float[np.ndarray, "3 3"],
+    *,
+    threshold_px: float,
+    seed: int,
+) -> RelativePose | None:
+    """Essential matrix and the one of its four decompositions with the points in front; None if it fails."""
+    if len(xy_a) < 8:
+        return None
+    essential, mask = cv2.findEssentialMat(
+        xy_a, xy_b, intrinsics_a, intrinsics_b, None, None, usac_parameters(threshold_px, seed)
+    )
+    if essential is None or mask is None or essential.shape != (3, 3):
+        return None
+    rays_a, rays_b = homogeneous_rays(xy_a, intrinsics_a), homogeneous_rays(xy_b, intrinsics_b)
+    inlier = mask.ravel().astype(bool)
+    count, rotation, translation, front = cv2.recoverPose(
+        essential, rays_a[inlier, :2], rays_b[inlier, :2], np.eye(3), distanceThresh=1e6
+    )[:4]
+    if count < 8:
+        return None
+    inlier[np.flatnonzero(inlier)] = front.ravel().astype(bool)
+    translation = translation.ravel() / np.linalg.norm(translation)
+    points, _ = triangulate_pair(rays_a[inlier], rays_b[inlier], rotation, translation)
+    angle = ray_angle_deg(points, np.zeros(3), -rotation.T @ translation)
+    return RelativePose(rotation=rotation, translation=translation, inlier=inlier, angle_deg=float(np.median(angle)))
+
+
+def fit_rotation(
+    xy_a: Float[np.ndarray, "match 2"],
+    xy_b: Float[np.ndarray, "match 2"],
+    intrinsics_a: Float[np.ndarray, "3 3"],
+    intrinsics_b: Float[np.ndarray, "3 3"],
+    *,
+    threshold_px: float,
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "3 3"], Bool[np.ndarray, " match"]]:
+    """Rotation ``b_from_a`` that maps most rays of a onto those of b within ``threshold_px``, and who agrees.
+
+    RANSAC over pairs of matches (two rays fix a rotation), refitted on the inliers (Kabsch).
+    """
+    count = len(xy_a)
+    rays_a, rays_b = homogeneous_rays(xy_a, intrinsics_a), homogeneous_rays(xy_b, intrinsics_b)
+    unit_a = rays_a / np.linalg.norm(rays_a, axis=1, keepdims=True)
+    unit_b = rays_b / np.linalg.norm(rays_b, axis=1, keepdims=True)
+    best, best_inlier = np.eye(3), np.zeros(count, bool)
+    if count < 3:
+        return best, best_inlier
+
+    def agree(rotation: np.ndarray) -> np.ndarray:
+        moved = unit_a @ rotation.T
+        projected = moved @ intrinsics_b.T
+        error = np.linalg.norm(projected[:, :2] / np.maximum(projected[:, 2:], 1e-9) - xy_b, axis=1)
+        return (moved[:, 2] > 0) & (error < threshold_px)
+
+    for _ in range(60):
+        sample = rng.choice(count, 3, replace=False)
+        inlier = agree(kabsch(unit_a[sample], unit_b[sample]))
+        if inlier.sum() > best_inlier.sum():
+            best_inlier = inlier
+    for _ in range(3):
+        if best_inlier.sum() < 3:
+            break
+        best = kabsch(unit_a[best_inlier], unit_b[best_inlier])
+        best_inlier = agree(best)
+    return best, best_inlier
+
+
+def kabsch(from_rays: Float[np.ndarray, "ray 3"], to_rays: Float[np.ndarray, "ray 3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation R that minimises sum |R from - to|^2."""
+    u, _, vt = np.linalg.svd(to_rays.T @ from_rays)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def homogeneous_rays(
+    pixel_xy: Float[np.ndarray, "point 2"], intrinsics: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "point 3"]:
+    """Camera-frame rays with z = 1."""
+    x = (pixel_xy[:, 0] - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (pixel_xy[:, 1] - intrinsics[1, 2]) / intrinsics[1, 1]
+    return np.stack([x, y, np.ones_like(x)], 1)
+
+
+def triangulate_pair(
+    rays_a: Float[np.ndarray, "point 3"],
+    rays_b: Float[np.ndarray, "point 3"],
+    rotation: Float[np.ndarray, "3 3"],
+    translation: Float[np.ndarray, " 3"],
+) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, "point 2"]]:
+    """Points in a's frame nearest to both rays (midpoint), and their depths in (a, b); negative = behind.
+
+    Parallel rays give a point very far away, never a NaN.
+    """
+    centre_b = -rotation.T @ translation
+    directions_b = rays_b @ rotation
+    aa, bb = (rays_a * rays_a).sum(1), (directions_b * directions_b).sum(1)
+    ab = (rays_a * directions_b).sum(1)
+    a_c, b_c = rays_a @ centre_b, directions_b @ centre_b
+    denominator = np.maximum(aa * bb - ab * ab, 1e-12)
+    depth_a = (bb * a_c - ab * b_c) / denominator
+    depth_b = (ab * a_c - aa * b_c) / denominator
+    points = 0.5 * (rays_a * depth_a[:, None] + centre_b + directions_b * depth_b[:, None])
+    return points, np.stack([depth_a, depth_b], 1)
+
+
+def ray_angle_deg(
+    points: Float[np.ndarray, "point 3"],
+    centre_a: Float[np.ndarray, " 3"],
+    centre_b: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, " point"]:
+    """Angle under which each point sees the two camera centres."""
+    to_a, to_b = points - centre_a, points - centre_b
+    sine = np.linalg.norm(np.cross(to_a, to_b), axis=1)
+    return np.rad2deg(np.arctan2(sine, (to_a * to_b).sum(1)))
