@@ -68,17 +68,18 @@ class DenseConfig:
     depth_tolerance: float = 0.04  # and largest relative difference of depth
     max_cost: float = 0.6  # a confident pixel must match better than this
     min_part_px: int = 20  # smaller confident islands are dropped (at 320 pixels; scaled by area)
-    segment_tolerances: tuple[float, ...] = (0.35, 1.2)  # colour segments, fine and coarse
+    segment_tolerances: tuple[float, ...] = (0.8, 2.0)  # colour segments, fine and coarse
     min_segment_px: int = 40  # smallest segment (at 320 pixels; scaled by area)
     plane_tolerance: float = 0.05  # relative error at which a sample stops supporting a segment's plane
     min_plane_support: float = 0.35  # planes with less support are not used
     plane_weights: tuple[float, ...] = (0.3, 0.12)  # weight of a fully supported plane in the final fill, per scale
     smooth_reach: float = 0.054  # reach of the final fill as a share of the long side
+    stiffness: float = 1.0  # smoothness of the final fill against weights of 1
     colour_sigma: float = 0.04  # colour step that stops the final fill
     weight_agreed: float = 1.0  # confident, two or more other views agree
     weight_confident: float = 0.6  # confident, one other view agrees
     weight_raw: float = 0.001  # matched but not confident
-    weight_point: float = 2.0  # sparse points
+    weight_point: float = 10.0  # sparse points
     weight_interpolation: float = 0.003  # interpolation of the sparse points
 
 
@@ -260,7 +261,7 @@ def _fill_view(
     score = np.zeros(shape, np.float32)
     if known.any():
         min_size = max(4, round(config.min_segment_px * area))
-        tolerances = tuple(t * area for t in config.segment_tolerances)
+        tolerances = tuple(t * area**0.5 for t in config.segment_tolerances)
         partitions = segment_colours(view.rgb, tolerances=tolerances, min_size=min_size)
         for labels, plane_weight in zip(partitions, config.plane_weights, strict=True):
             plane, support = segment_planes(
@@ -270,7 +271,9 @@ def _fill_view(
             value, weight = _blend(value, weight, np.log(plane), plane_weight * support)
             score = np.maximum(score, support)
     reach = config.smooth_reach * max(shape)
-    filled = smooth_fill(value, weight, view.rgb, reach_px=reach, colour_sigma=config.colour_sigma)
+    filled = smooth_fill(
+        value, weight, view.rgb, reach_px=reach, stiffness=config.stiffness, colour_sigma=config.colour_sigma
+    )
     return np.exp(-filled), _evidence(
         view, matched, agreement, confident=confident, score=score, filled=filled, interpolated=interpolated
     )

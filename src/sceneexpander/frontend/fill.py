@@ -41,33 +41,58 @@ def pixels_to_nearest(xy: Array64, shape: tuple[int, int]) -> Image32:
 
 
 def smooth_fill(
-    value: Image32, weight: Image32, rgb: Image32, *, reach_px: float, colour_sigma: float, rounds: int = 3
+    value: Image32,
+    weight: Image32,
+    rgb: Image32,
+    *,
+    reach_px: float,
+    stiffness: float,
+    colour_sigma: float,
+    rounds: int = 3,
+    relaxations: int = 3,
 ) -> Image32:
-    """Weighted edge-aware smoothing: Min et al. 2014, "Fast global image smoothing based on weighted least squares".
+    """The image u that minimises ``sum weight (u - value)^2 + stiffness sum exp(-colour step / sigma) (u_p - u_q)^2``.
 
-    Separable: each round solves one tridiagonal system along all rows and one along all columns, with smoothness
-    ``reach_px ** 2`` split over the rounds as in eq. 13, for the weighted values and for the weights (their ratio is the
-    result). ``weight`` must be positive somewhere on every image.
+    First guess by the fast global smoother (Min et al. 2014, "Fast global image smoothing based on weighted least
+    squares", eq. 13, with smoothness ``reach_px ** 2``), applied to the weighted values and to the weights: it carries known
+    values across large gaps, but blurs where many are known. Line relaxation, rows and columns in turn, then
+    settles the guess on the minimum. ``weight`` must be positive.
     """
-    across = np.exp(-np.sqrt(((rgb[:, 1:] - rgb[:, :-1]) ** 2).mean(-1)) / colour_sigma)
-    down = np.exp(-np.sqrt(((rgb[1:] - rgb[:-1]) ** 2).mean(-1)) / colour_sigma).T
+    across = np.exp(-np.sqrt(((rgb[:, 1:] - rgb[:, :-1]) ** 2).mean(-1)) / colour_sigma).astype(np.float64)
+    down = np.exp(-np.sqrt(((rgb[1:] - rgb[:-1]) ** 2).mean(-1)) / colour_sigma).T.astype(np.float64)
     stacked = np.stack([value.astype(np.float64) * weight, weight.astype(np.float64)])
+    ones = np.ones(value.shape)
     for k in range(rounds):
         smoothness = 1.5 * 4 ** (rounds - 1 - k) / (4**rounds - 1) * reach_px**2
-        stacked = _solve_rows(stacked, smoothness * across.astype(np.float64))
-        turned = _solve_rows(stacked.transpose(0, 2, 1), smoothness * down.astype(np.float64))
-        stacked = turned.transpose(0, 2, 1)
-    return (stacked[0] / stacked[1]).astype(np.float32)
+        stacked = _solve_rows(stacked, ones, smoothness * across)
+        stacked = _solve_rows(stacked.transpose(0, 2, 1), ones.T, smoothness * down).transpose(0, 2, 1)
+    guess = stacked[0] / stacked[1]
+    data, known = weight.astype(np.float64), value.astype(np.float64) * weight
+    across, down = stiffness * across, stiffness * down
+    for _ in range(relaxations):
+        guess = _relax_rows(guess, known, data, across, down.T)
+        guess = _relax_rows(guess.T, known.T, data.T, down, across.T).T
+    return guess.astype(np.float32)
 
 
-def _solve_rows(images: Array64, coupling: Array64) -> Array64:
-    """Solve (I + L) u = f along every row; L is the path Laplacian with weights ``coupling`` (height, width - 1)."""
+def _relax_rows(guess: Array64, known: Array64, data: Array64, across: Array64, down: Array64) -> Array64:
+    """Solve every row exactly, its neighbouring rows held at ``guess``."""
+    right, diagonal = known.copy(), data.copy()
+    right[1:] += down * guess[:-1]
+    right[:-1] += down * guess[1:]
+    diagonal[1:] += down
+    diagonal[:-1] += down
+    return _solve_rows(right[None], diagonal, across)[0]
+
+
+def _solve_rows(images: Array64, data: Array64, coupling: Array64) -> Array64:
+    """Solve (diag(data) + L) u = f along every row; L is the path Laplacian with weights ``coupling`` (height, width - 1)."""
     from scipy.linalg.lapack import dptsv
 
     channels, height, width = images.shape
     links = np.zeros((height, width))
     links[:, :-1] = coupling
-    diagonal = 1 + links
+    diagonal = data + links
     diagonal[:, 1:] += coupling
     # All rows as one system: the link from the end of a row to the start of the next is zero.
     right = np.asfortranarray(images.reshape(channels, -1).T)
