@@ -7,6 +7,7 @@ fall, the old weights are kept. Models with strong weights of their own do not n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -38,7 +39,10 @@ class WarmupConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WarmupReport:
-    """Held-out error (mean absolute colour difference, weighted like the loss) before and after; accepted or not."""
+    """Held-out error (mean absolute colour difference, weighted like the loss) before and after; accepted or not.
+
+    ``after`` is infinite if the steps led to cameras or Gaussians that cannot be rendered.
+    """
 
     steps: int
     before: float
@@ -113,6 +117,8 @@ def warm_up(
     for step in range(config.steps):
         view = order[step % views]
         prediction = model.predict(images, priors, heads=ALL_HEADS)
+        if not _renderable(prediction):
+            break  # the steps were too large for this scene: the check below rejects the result
         loss = photometric_error(prediction, images, view, ~hidden[view], config)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -128,6 +134,15 @@ def warm_up(
     return WarmupReport(steps=config.steps, before=before, after=after, accepted=accepted)
 
 
+def _renderable(prediction: Prediction) -> bool:
+    """Whether cameras and Gaussians are finite and the focal lengths positive."""
+    values = [prediction.world_from_cam, prediction.intrinsics_px]
+    if prediction.gaussians is not None:
+        values += [prediction.gaussians.means, prediction.gaussians.scales, prediction.gaussians.opacities]
+    finite = all(bool(torch.isfinite(value).all()) for value in values)
+    return finite and bool((prediction.intrinsics_px[:, [0, 1], [0, 1]] > 0).all())
+
+
 @torch.no_grad()
 def _held_out_error(
     model: Reconstructor,
@@ -137,5 +152,7 @@ def _held_out_error(
     config: WarmupConfig,
 ) -> float:
     prediction = model.predict(images, priors, heads=ALL_HEADS)
+    if not _renderable(prediction):
+        return math.inf
     errors = [photometric_error(prediction, images, v, hidden[v], config) for v in range(images.shape[0])]
     return float(torch.stack(errors).mean())

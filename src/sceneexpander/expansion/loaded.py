@@ -84,7 +84,7 @@ def load_model(config: ModelConfig, device: torch.device | str = "cpu") -> Loade
     return LoadedModel(
         model=built.model,
         base=base,
-        weights_sha256=built.weights_sha256,
+        weights_sha256=built.weights.sha256,
         licence=built.licence,
         device=target,
         priors=config.priors,

@@ -1,0 +1,96 @@
+"""Reconstructors by name: architecture, weights and licence."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from sceneexpander.errors import UserError
+from sceneexpander.models.protocol import Reconstructor
+from sceneexpander.models.weights import ResolvedWeights, load_weights, resolve_weights
+
+DEFAULT_VARIANT = "default"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BuiltReconstructor:
+    """A reconstructor with its weights, and what a report says about them."""
+
+    model: Reconstructor
+    weights: ResolvedWeights
+    licence: str
+
+
+def _mini(variant: str, weights: ResolvedWeights) -> Reconstructor:
+    from sceneexpander.models.mini import Mini
+
+    _check_variant("mini", variant, (DEFAULT_VARIANT,))
+    return Mini.from_weights(weights.path)
+
+
+def _worldmirror(variant: str, weights: ResolvedWeights) -> Reconstructor:
+    from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
+
+    configs: dict[str, Callable[[], WorldMirrorConfig]] = {
+        DEFAULT_VARIANT: WorldMirrorConfig.large,
+        "large": WorldMirrorConfig.large,
+        "tiny": WorldMirrorConfig.tiny,
+    }
+    _check_variant("worldmirror", variant, tuple(configs))
+    with torch.device("meta"):
+        model = WorldMirror(configs[variant]())
+    load_weights(model, weights.path)
+    return model
+
+
+_BUILDERS: dict[str, tuple[Callable[[str, ResolvedWeights], Reconstructor], str]] = {
+    "mini": (_mini, "Apache-2.0, made by this project"),
+    "worldmirror": (
+        _worldmirror,
+        "Tencent HunyuanWorld-Mirror community licence: not valid in the EU, the UK and South Korea; adapted weights are derivatives",
+    ),
+}
+
+
+def reconstructor_names() -> tuple[str, ...]:
+    """The names that `build_reconstructor` knows."""
+    return tuple(_BUILDERS)
+
+
+def build_reconstructor(
+    name: str, *, variant: str = DEFAULT_VARIANT, weights: str, allow_download: bool = False
+) -> BuiltReconstructor:
+    """Build a reconstructor on the CPU and load its weights strictly.
+
+    Args:
+        name: see `reconstructor_names`.
+        variant: a configuration of it; "default" is the released one.
+        weights: see `sceneexpander.models.weights.resolve_weights`.
+        allow_download: let a hub id use the network.
+
+    Raises:
+        UserError: unknown name or variant; weights that are missing or do not fit.
+    """
+    if name not in _BUILDERS:
+        raise UserError(
+            f"unknown reconstructor {name!r}", where="model.name", fix=_did_you_mean(name, tuple(_BUILDERS))
+        )
+    builder, licence = _BUILDERS[name]
+    resolved = resolve_weights(weights, model=name, allow_download=allow_download)
+    model = builder(variant, resolved)
+    return BuiltReconstructor(model=model, weights=resolved, licence=licence)
+
+
+def _check_variant(model: str, variant: str, known: tuple[str, ...]) -> None:
+    if variant not in known:
+        raise UserError(
+            f"unknown variant {variant!r} of {model}", where="model.variant", fix=_did_you_mean(variant, known)
+        )
+
+
+def _did_you_mean(text: str, known: tuple[str, ...]) -> str:
+    close = difflib.get_close_matches(text, known, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
