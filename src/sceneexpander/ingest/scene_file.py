@@ -12,7 +12,7 @@ from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.ingest.listing import list_pictures, require_inside
 
 SCENE_FILE = "scene.yaml"
-_SCENE_KEYS = frozenset({"name", "source", "rounds", "order", "images"})
+_SCENE_KEYS = frozenset({"name", "source", "licence", "rounds", "order", "images"})
 _ROUND_KEYS = frozenset({"prompt", "motion", "object", "inserted"})
 
 
@@ -22,6 +22,7 @@ class SceneFile:
 
     name: str | None
     source: str
+    licence: str
     images: str
     order: tuple[str, ...]  # file names that come first, in this order; empty: natural order
     rounds: tuple[RoundSpec, ...]
@@ -51,6 +52,7 @@ def read_scene_file(folder: Path) -> SceneFile:
     return SceneFile(
         name=_text(content, "name", path, "the file") or None,
         source=_text(content, "source", path, "the file"),
+        licence=_text(content, "licence", path, "the file"),
         images=_text(content, "images", path, "the file") or "captured",
         order=_names(content.get("order"), path),
         rounds=tuple(_round(folder, path, item, number) for number, item in enumerate(rounds, start=1)),

@@ -1,0 +1,134 @@
+"""Numbers about one reconstruction: one row per scene, round, method and seed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
+
+SCHEMA = "metrics/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewMetrics:
+    """What one view's camera sees of the reconstruction, against that view's picture. None: not defined there.
+
+    ``psnr_db`` is capped (equal images would be infinite). ``coverage`` is the share of pixels with alpha above the threshold.
+    ``depth_disagreement`` is the median of |rendered - per-view depth| / per-view depth over covered pixels. The ``others_`` columns use
+    only Gaussians that came from *other* views, over the pixels that those cover (share ``others_coverage``): a picture that agrees with
+    its neighbours scores high, doubled contours (ghosting) score low. ``generated_share`` is the part of alpha that Gaussians
+    of generated views contribute.
+    """
+
+    view_id: str
+    generated: bool
+    posed: bool
+    psnr_db: float
+    ssim: float
+    coverage: float
+    generated_share: float
+    depth_disagreement: float | None = None
+    others_coverage: float | None = None
+    others_psnr_db: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruthMetrics:
+    """Against known truth. Angles in degrees, from relative poses of view pairs; ATE in the truth's unit; depths after one common scale.
+
+    The scale is the median ratio of true to estimated depth over all captured views; the inserted view's new region
+    uses that same scale.
+    """
+
+    camera_rotation_deg: float | None = None
+    camera_direction_deg: float | None = None
+    camera_ate: float | None = None
+    depth_abs_rel: float | None = None
+    depth_within_125: float | None = None
+    inserted_rotation_deg: float | None = None
+    inserted_direction_deg: float | None = None
+    new_region_abs_rel: float | None = None
+    new_region_within_125: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MetricsRow:
+    """One method's result on one scene. Means are over views; None means not known or not applicable, never zero.
+
+    ``psnr_db`` and ``ssim`` are over the captured views (preservation), ``inserted_`` over the view inserted in this round.
+    ``navigation_coverage`` is the mean share of covered pixels over the frames of the navigation.
+    """
+
+    scene: str
+    round: int
+    method: str
+    model: str
+    weights_sha256: str
+    seed: int
+    captured_views: int
+    generated_views: int
+    gaussians: int
+    generated_gaussians: int
+    psnr_db: float
+    ssim: float
+    coverage: float
+    depth_disagreement: float | None = None
+    others_psnr_db: float | None = None
+    inserted_psnr_db: float | None = None
+    inserted_ssim: float | None = None
+    inserted_generated_share: float | None = None
+    inserted_others_psnr_db: float | None = None
+    navigation_coverage: float | None = None
+    navigation_frames: int = 0
+    truth: TruthMetrics | None = None
+    views: tuple[ViewMetrics, ...] = ()
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for item in (self, self.truth, *self.views):
+            if item is None:
+                continue
+            for f in fields(item):
+                value = getattr(item, f.name)
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise ValueError(f"{type(item).__name__}.{f.name} is {value}; leave out what is not known")
+
+    def value(self, name: str) -> float | None:
+        """A number by name; names of truth metrics start with ``truth.``."""
+        head, _, tail = name.partition(".")
+        holder: Any = self
+        if head == "truth":
+            holder, head = self.truth, tail
+        number = None if holder is None else getattr(holder, head)
+        return None if number is None else float(number)
+
+    def numbers(self) -> dict[str, float]:
+        """All known numbers by flat name (truth metrics as ``truth_...``): for tracking."""
+        found: dict[str, float] = {}
+        for prefix, holder in (("", self), ("truth_", self.truth)):
+            for f in fields(holder) if holder is not None else ():
+                value = getattr(holder, f.name)
+                if isinstance(value, (int, float)) and not isinstance(value, bool) and f.name not in {"round", "seed"}:
+                    found[prefix + f.name] = float(value)
+        return found
+
+    def save(self, path: Path) -> None:
+        """Write as a JSON file, atomically."""
+        plain = {f.name: getattr(self, f.name) for f in fields(self)}
+        write_json_atomic(path, {**plain, "schema": SCHEMA})
+
+    @classmethod
+    def load(cls, path: Path) -> MetricsRow:
+        """Read what `save` wrote. Raises `ArtifactError` for another schema or a damaged file."""
+        content = read_json(path)
+        if not isinstance(content, dict) or content.pop("schema", None) != SCHEMA:
+            raise ArtifactError(f"is not of schema {SCHEMA!r}", where=path, fix="rerun the evaluation")
+        try:
+            truth = content.pop("truth")
+            views = tuple(ViewMetrics(**item) for item in content.pop("views"))
+            return cls(**content, views=views, truth=None if truth is None else TruthMetrics(**truth))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ArtifactError(f"is invalid ({error})", where=path, fix="rerun the evaluation") from None

@@ -1,0 +1,31 @@
+"""What the evaluation lets one choose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sceneexpander.errors import UserError
+from sceneexpander.splatting.settings import RasterSettings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateConfig:
+    """Settings of `evaluate`.
+
+    Attributes:
+        coverage_alpha: a pixel counts as covered if its alpha is above this.
+        antialiased: render with the antialiased opacity compensation.
+        cross_view: also compare each view with what the other views' Gaussians show (one more rendering per view).
+    """
+
+    coverage_alpha: float = 0.5
+    antialiased: bool = False
+    cross_view: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 < self.coverage_alpha < 1:
+            raise UserError(f"must be between 0 and 1, is {self.coverage_alpha}", where="evaluate.coverage_alpha")
+
+    def raster_settings(self) -> RasterSettings:
+        """As the renderer takes them."""
+        return RasterSettings(antialiased=self.antialiased)

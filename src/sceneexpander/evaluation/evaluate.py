@@ -1,0 +1,115 @@
+"""All numbers about one reconstruction as one row."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.truth import SceneTruth, against_truth
+from sceneexpander.evaluation.views import insertion_fidelity, navigation_coverage, preservation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Navigation:
+    """Frames of a camera path, in the frame of the reconstruction that is evaluated."""
+
+    world_from_cam: Float[Tensor, "frame 4 4"]
+    intrinsics_px: Float[Tensor, "frame 3 3"]
+    height: int
+    width: int
+
+
+def evaluate(
+    reconstruction: Reconstruction,
+    views: ViewSet,
+    config: EvaluateConfig,
+    *,
+    scene: str,
+    round_number: int,
+    seed: int,
+    navigation: Navigation | None = None,
+    truth: SceneTruth | None = None,
+) -> MetricsRow:
+    """Measure a reconstruction.
+
+    Args:
+        reconstruction: of captured and perhaps generated views.
+        views: pictures of at least the reconstruction's views.
+        config: settings.
+        scene: name for the row.
+        round_number: the round; the ``inserted_`` numbers are those of the view inserted in it (the last generated one).
+        seed: for the row.
+        navigation: frames for the coverage, if wanted.
+        truth: known truth, if any.
+    """
+    captured = preservation(reconstruction, views, config)
+    inserted = insertion_fidelity(reconstruction, views, config)
+    last = inserted[-1] if inserted else None
+    frames = None
+    if navigation is not None:
+        frames = navigation_coverage(
+            reconstruction,
+            navigation.world_from_cam,
+            navigation.intrinsics_px,
+            navigation.height,
+            navigation.width,
+            config,
+        )
+    return MetricsRow(
+        scene=scene,
+        round=round_number,
+        method=reconstruction.method,
+        model=reconstruction.model,
+        weights_sha256=reconstruction.weights_sha256,
+        seed=seed,
+        captured_views=len(captured),
+        generated_views=len(inserted),
+        gaussians=len(reconstruction.gaussians),
+        generated_gaussians=int(reconstruction.gaussians.generated.sum()),
+        psnr_db=_mean(row.psnr_db for row in captured),
+        ssim=_mean(row.ssim for row in captured),
+        coverage=_mean(row.coverage for row in captured),
+        depth_disagreement=_mean_of_all(captured, "depth_disagreement"),
+        others_psnr_db=_mean_of_all(captured, "others_psnr_db"),
+        inserted_psnr_db=None if last is None else last.psnr_db,
+        inserted_ssim=None if last is None else last.ssim,
+        inserted_generated_share=None if last is None else last.generated_share,
+        inserted_others_psnr_db=None if last is None else last.others_psnr_db,
+        navigation_coverage=None if frames is None else float(frames.double().mean()),
+        navigation_frames=0 if frames is None else len(frames),
+        truth=None if truth is None else against_truth(reconstruction, views, truth),
+        views=(*captured, *inserted),
+        versions=_versions(),
+    )
+
+
+def _mean(values: Iterable[float]) -> float:
+    found = list(values)
+    if not found:
+        raise ValueError("the reconstruction has no captured view")
+    return sum(found) / len(found)
+
+
+def _mean_of_all(rows: tuple[ViewMetrics, ...], name: str) -> float | None:
+    """Mean over the views, or None as soon as one of them has no value: a mean over fewer views is another number."""
+    values = [getattr(row, name) for row in rows]
+    return None if any(value is None for value in values) else _mean(values)
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in ("sceneexpander", "torch", "numpy"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "source"
+    return found

@@ -1,0 +1,140 @@
+"""Comparison tables in the shape of the paper: one line per method, means over scenes, gaps shown as gaps."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sceneexpander.artifacts.metrics import MetricsRow
+
+MISSING = "missing"
+NOT_APPLICABLE = "–"
+CEILING = "captured"
+
+METHOD_TITLES = {
+    "captured": "captured only (ceiling of preservation)",
+    "backbone": "backbone with the inserted view, unadapted",
+    "sceneexpander": "SceneExpander",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """One number of a `MetricsRow`. ``better`` is an arrow in the title. ``expansion``: without meaning for captured views alone."""
+
+    name: str
+    title: str
+    better: str
+    digits: int = 2
+    expansion: bool = False
+
+
+COLUMNS: tuple[Column, ...] = (
+    Column(name="psnr_db", title="PSNR", better="↑"),
+    Column(name="ssim", title="SSIM", better="↑", digits=3),
+    Column(name="others_psnr_db", title="cross-view PSNR", better="↑"),
+    Column(name="inserted_psnr_db", title="insertion PSNR", better="↑", expansion=True),
+    Column(name="inserted_ssim", title="insertion SSIM", better="↑", digits=3, expansion=True),
+    Column(name="navigation_coverage", title="coverage", better="↑", digits=3),
+    Column(name="coverage_gained", title="coverage gained", better="↑", digits=3, expansion=True),
+    Column(name="truth.camera_rotation_deg", title="camera rotation °", better="↓"),
+    Column(name="truth.depth_abs_rel", title="depth AbsRel", better="↓", digits=3),
+    Column(name="truth.inserted_rotation_deg", title="inserted rotation °", better="↓", expansion=True),
+    Column(name="truth.new_region_abs_rel", title="new-region AbsRel", better="↓", digits=3, expansion=True),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A header and lines of text, equally long."""
+
+    header: tuple[str, ...]
+    lines: tuple[tuple[str, ...], ...]
+
+    def markdown(self) -> str:
+        """As a Markdown table; the first column is left-aligned."""
+        rule = [":--"] + ["--:"] * (len(self.header) - 1)
+        lines = [self.header, tuple(rule), *self.lines]
+        return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+
+    def csv(self) -> str:
+        """As CSV (RFC 4180)."""
+        buffer = io.StringIO()
+        csv.writer(buffer).writerows([self.header, *self.lines])
+        return buffer.getvalue()
+
+
+Cell = tuple[str, int, int]  # scene, round, seed
+
+
+def comparison_table(rows: Sequence[MetricsRow], columns: Sequence[Column] = COLUMNS) -> Table:
+    """One line per method: the mean over all scene, round and seed cells that occur in ``rows`` for any method.
+
+    A mean over fewer cells than there are is followed by its count, e.g. ``21.40 (3/4)``; without any value the cell says ``missing``.
+    Columns that no row has a value for are left out. Means of lines with different counts cannot be compared.
+
+    Raises:
+        ValueError: two rows have the same scene, round, seed and method.
+    """
+    by_key = _indexed(rows)
+    cells = sorted({key[0] for key in by_key})
+    shown = [column for column in columns if any(_value(by_key, *key, column) is not None for key in by_key)]
+    lines = []
+    for method in _methods(rows):
+        values = [_cell_text(by_key, cells, method, column) for column in shown]
+        lines.append((METHOD_TITLES.get(method, method), str(sum((cell, method) in by_key for cell in cells)), *values))
+    header = ("method", f"cells of {len(cells)}", *(f"{column.title} {column.better}" for column in shown))
+    return Table(header=header, lines=tuple(lines))
+
+
+def scene_table(rows: Sequence[MetricsRow], columns: Sequence[Column] = COLUMNS) -> Table:
+    """One line per scene, round, seed and method, absent ones included as missing. Raises as `comparison_table`."""
+    by_key = _indexed(rows)
+    shown = [column for column in columns if any(_value(by_key, *key, column) is not None for key in by_key)]
+    lines = []
+    for cell in sorted({key[0] for key in by_key}):
+        for method in _methods(rows):
+            values = [_cell_text(by_key, [cell], method, column) for column in shown]
+            lines.append((cell[0], str(cell[1]), str(cell[2]), METHOD_TITLES.get(method, method), *values))
+    header = ("scene", "round", "seed", "method", *(f"{column.title} {column.better}" for column in shown))
+    return Table(header=header, lines=tuple(lines))
+
+
+def _indexed(rows: Sequence[MetricsRow]) -> dict[tuple[Cell, str], MetricsRow]:
+    found: dict[tuple[Cell, str], MetricsRow] = {}
+    for row in rows:
+        key = ((row.scene, row.round, row.seed), row.method)
+        if key in found:
+            raise ValueError(f"two rows for scene {row.scene!r}, round {row.round}, seed {row.seed}, {row.method!r}")
+        found[key] = row
+    return found
+
+
+def _methods(rows: Sequence[MetricsRow]) -> list[str]:
+    known = list(METHOD_TITLES)
+    return sorted({row.method for row in rows}, key=lambda m: (known.index(m) if m in known else len(known), m))
+
+
+def _value(by_key: dict[tuple[Cell, str], MetricsRow], cell: Cell, method: str, column: Column) -> float | None:
+    row = by_key.get((cell, method))
+    if row is None or (column.expansion and method == CEILING):
+        return None
+    if column.name != "coverage_gained":
+        return row.value(column.name)
+    before = by_key.get((cell, CEILING))
+    after = row.navigation_coverage
+    if before is None or before.navigation_coverage is None or after is None:
+        return None
+    return after - before.navigation_coverage
+
+
+def _cell_text(by_key: dict[tuple[Cell, str], MetricsRow], cells: Sequence[Cell], method: str, column: Column) -> str:
+    if column.expansion and method == CEILING:
+        return NOT_APPLICABLE
+    values = [value for cell in cells if (value := _value(by_key, cell, method, column)) is not None]
+    if not values:
+        return MISSING
+    text = f"{sum(values) / len(values):.{column.digits}f}"
+    return text if len(values) == len(cells) else f"{text} ({len(values)}/{len(cells)})"

@@ -1,0 +1,254 @@
+"""Known truth of a scene, and how far a reconstruction is from it.
+
+A scene folder may have ``truth/``::
+
+    truth/cameras.json        {"intrinsics_px": 3x3, "captured": [{"file": "captured/a.jpg", "world_from_cam": 4x4}, ...],
+                               "inserted": {"file": "inserted/round_1.png", "world_from_cam": 4x4}}
+    truth/depth/<stem>.png    z-depth of a captured view: 16 bits, millimetres, 0 where unknown
+    truth/depth/inserted.png  the same for the inserted view, as it would be if it agreed with the scene
+    truth/new_region.png      non-zero where that consistent inserted view shows what no captured view sees
+
+``file`` is relative to the scene folder; ``inserted`` and the pictures may be absent. Cameras follow the project's conventions;
+intrinsics and maps have the pixels of the original pictures. An inserted picture that is misaligned on purpose is held against the
+consistent view: its pixels are a little off from the truth's, so its errors have a floor that no method gets below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image
+from torch import Tensor
+
+from sceneexpander.artifacts.metrics import TruthMetrics
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.store import ArtifactError, read_json, sha256_of_file
+from sceneexpander.artifacts.views import ViewRecord, ViewSet
+from sceneexpander.geometry.camera import pixel_centres
+from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
+from sceneexpander.geometry.similarity import umeyama
+
+TRUTH_FOLDER = "truth"
+_MILLIMETRE = 1e-3
+_WITHIN = 1.25
+_SHORT_BASELINE = 1e-6  # of the largest one: no direction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewTruth:
+    """Truth of one picture, in its original pixels. ``depth`` is 0 where unknown."""
+
+    world_from_cam: Float[Tensor, "4 4"]
+    intrinsics_px: Float[Tensor, "3 3"]
+    depth: Float[Tensor, "height width"] | None = None
+    new_region: Bool[Tensor, "height width"] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneTruth:
+    """Truth by the digest of the picture's bytes: a picture that was exchanged has none."""
+
+    views: dict[str, ViewTruth] = field(default_factory=dict)
+
+    def of(self, record: ViewRecord) -> ViewTruth | None:
+        """Truth of a view, if known."""
+        return self.views.get(record.sha256)
+
+
+def load_truth(scene_folder: Path) -> SceneTruth | None:
+    """Read ``scene_folder/truth``; None if there is none. Raises `ArtifactError` if it is there but damaged."""
+    folder = scene_folder / TRUTH_FOLDER
+    path = folder / "cameras.json"
+    if not path.exists():
+        return None
+    content = read_json(path)
+    try:
+        intrinsics = _matrix(content["intrinsics_px"], 3)
+        views: dict[str, ViewTruth] = {}
+        for item in content["captured"]:
+            depth = _depth_map(folder / "depth" / f"{Path(item['file']).stem}.png")
+            pose = _matrix(item["world_from_cam"], 4)
+            digest = sha256_of_file(scene_folder / item["file"])
+            views[digest] = ViewTruth(world_from_cam=pose, intrinsics_px=intrinsics, depth=depth)
+        inserted = content.get("inserted")
+        if inserted is not None:
+            views[sha256_of_file(scene_folder / inserted["file"])] = ViewTruth(
+                world_from_cam=_matrix(inserted["world_from_cam"], 4),
+                intrinsics_px=intrinsics,
+                depth=_depth_map(folder / "depth" / "inserted.png"),
+                new_region=_mask(folder / "new_region.png"),
+            )
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise ArtifactError(f"is invalid ({reason})", where=path, fix="mend or remove the scene's truth/") from None
+    return SceneTruth(views=views)
+
+
+def _matrix(rows: Any, size: int) -> Tensor:
+    matrix = torch.tensor(rows, dtype=torch.float64)
+    if matrix.shape != (size, size) or not bool(torch.isfinite(matrix).all()):
+        raise ValueError(f"expected a finite {size} x {size} matrix, got {tuple(matrix.shape)}")
+    return matrix
+
+
+def _depth_map(path: Path) -> Float[Tensor, "height width"] | None:
+    if not path.exists():
+        return None
+    with Image.open(path) as picture:
+        values = np.asarray(picture)
+    if values.ndim != 2 or values.dtype == np.uint8:
+        raise ValueError(f"{path.name} is not a 16-bit grey picture")
+    return torch.from_numpy(values.astype(np.float32) * np.float32(_MILLIMETRE))
+
+
+def _mask(path: Path) -> Bool[Tensor, "height width"] | None:
+    if not path.exists():
+        return None
+    with Image.open(path) as picture:
+        return torch.from_numpy(np.asarray(picture.convert("L")) > 127)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Known:
+    """A view of the reconstruction with its truth, brought to stored pixels."""
+
+    index: int
+    truth: ViewTruth
+    depth: Float[Tensor, "height width"] | None
+    new_region: Bool[Tensor, "height width"] | None
+
+
+def against_truth(reconstruction: Reconstruction, views: ViewSet, truth: SceneTruth) -> TruthMetrics:
+    """Errors of cameras and depths; None where too little is known (see `TruthMetrics`)."""
+    records = {record.view_id: record for record in views.records}
+    known = []
+    for index, view_id in enumerate(reconstruction.view_ids):
+        record = records.get(view_id)
+        found = None if record is None else truth.of(record)
+        if record is not None and found is not None:
+            height, width = reconstruction.depth.shape[1:]
+            known.append(
+                _Known(
+                    index=index,
+                    truth=found,
+                    depth=_in_stored_pixels(found.depth, record, height, width),
+                    new_region=_in_stored_pixels(found.new_region, record, height, width),
+                )
+            )
+    captured = [item for item in known if not bool(reconstruction.generated[item.index])]
+    inserted = [item for item in known if bool(reconstruction.generated[item.index])][-1:]
+    rotation, direction = _pair_errors(reconstruction, _pairs(captured, captured))
+    inserted_rotation, inserted_direction = _pair_errors(reconstruction, _pairs(captured, inserted))
+    scale = _depth_scale(reconstruction, captured)
+    depth_errors = _depth_errors(reconstruction, captured, scale)
+    new_errors = _depth_errors(reconstruction, inserted, scale, new_region=True)
+    return TruthMetrics(
+        camera_rotation_deg=rotation,
+        camera_direction_deg=direction,
+        camera_ate=_trajectory_error(reconstruction, captured),
+        depth_abs_rel=depth_errors[0],
+        depth_within_125=depth_errors[1],
+        inserted_rotation_deg=inserted_rotation,
+        inserted_direction_deg=inserted_direction,
+        new_region_abs_rel=new_errors[0],
+        new_region_within_125=new_errors[1],
+    )
+
+
+def _in_stored_pixels(plane: Tensor | None, record: ViewRecord, height: int, width: int) -> Tensor | None:
+    """A map of the original picture at the centres of the stored pixels: nearest sample, 0 (False) outside."""
+    if plane is None:
+        return None
+    centres = pixel_centres(height, width, like=torch.zeros((), dtype=torch.float64))
+    affine = torch.tensor(record.original_from_stored(), dtype=torch.float64)
+    x, y = (centres @ affine[:, :2].T + affine[:, 2]).floor().long().unbind(-1)
+    rows, columns = plane.shape
+    if (rows, columns) != (record.original_height, record.original_width):
+        raise ArtifactError(
+            f"truth of {rows} x {columns} pixels for a picture of {record.original_height} x {record.original_width}",
+            where=record.name,
+        )
+    inside = (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
+    values = plane[y.clamp(0, rows - 1), x.clamp(0, columns - 1)]
+    return torch.where(inside, values, torch.zeros_like(values))
+
+
+def _pairs(first: list[_Known], second: list[_Known]) -> list[tuple[_Known, _Known]]:
+    return [(a, b) for a in first for b in second if a.index < b.index]
+
+
+def _pair_errors(
+    reconstruction: Reconstruction, pairs: list[tuple[_Known, _Known]]
+) -> tuple[float | None, float | None]:
+    """Mean errors of relative rotation and of the direction of relative translation, degrees: free of frame and scale.
+
+    A direction is undefined for true baselines of zero length (left out); an estimate of zero length counts as 90 degrees off.
+    """
+    poses = reconstruction.world_from_cam.double()
+    true = [rigid_inverse(a.truth.world_from_cam) @ b.truth.world_from_cam for a, b in pairs]
+    estimated = [rigid_inverse(poses[a.index]) @ poses[b.index] for a, b in pairs]
+    longest = max((float(pose[:3, 3].norm()) for pose in true), default=0.0)
+    rotations, directions = [], []
+    for guess, truth in zip(estimated, true, strict=True):
+        rotations.append(float(rotation_angle_deg(guess[:3, :3], truth[:3, :3])))
+        if float(truth[:3, 3].norm()) > _SHORT_BASELINE * longest:
+            directions.append(_angle_deg(guess[:3, 3], truth[:3, 3]))
+    return _mean(rotations), _mean(directions)
+
+
+def _angle_deg(estimated: Float[Tensor, 3], true: Float[Tensor, 3]) -> float:
+    if float(estimated.norm()) == 0:
+        return 90.0
+    cross = torch.linalg.cross(estimated, true).norm()
+    return float(torch.rad2deg(torch.atan2(cross, (estimated * true).sum())))
+
+
+def _trajectory_error(reconstruction: Reconstruction, captured: list[_Known]) -> float | None:
+    """Root mean square distance of camera centres after the best similarity; None if that is not determined."""
+    if len(captured) < 3:
+        return None
+    estimated = reconstruction.world_from_cam[[item.index for item in captured], :3, 3].double()
+    true = torch.stack([item.truth.world_from_cam[:3, 3] for item in captured])
+    try:
+        aligned = umeyama(estimated, true).points(estimated)
+    except ValueError:
+        return None  # cameras on one line
+    return float(((aligned - true) ** 2).sum(-1).mean().sqrt())
+
+
+def _depth_scale(reconstruction: Reconstruction, captured: list[_Known]) -> float | None:
+    """True unit per scene unit: one number for the whole reconstruction."""
+    ratios = [
+        (item.depth / reconstruction.depth[item.index])[item.depth > 0] for item in captured if item.depth is not None
+    ]
+    together = torch.cat(ratios) if ratios else torch.zeros(0)
+    return float(together.median()) if together.numel() else None
+
+
+def _depth_errors(
+    reconstruction: Reconstruction, items: list[_Known], scale: float | None, *, new_region: bool = False
+) -> tuple[float | None, float | None]:
+    """(mean |d - d*| / d*, share of max(d / d*, d* / d) < 1.25) over all pixels with known depth."""
+    errors, ratios = [], []
+    for item in items:
+        if scale is None or item.depth is None or (new_region and item.new_region is None):
+            continue
+        valid = item.depth > 0
+        if new_region and item.new_region is not None:
+            valid = valid & item.new_region
+        estimated, true = reconstruction.depth[item.index][valid] * scale, item.depth[valid]
+        errors.append((estimated - true).abs() / true)
+        ratios.append(torch.maximum(estimated / true, true / estimated))
+    together = torch.cat(errors) if errors else torch.zeros(0)
+    if not together.numel():
+        return None, None
+    return float(together.double().mean()), float((torch.cat(ratios) < _WITHIN).double().mean())
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None

@@ -1,0 +1,97 @@
+"""Tables: order, means, and gaps that stay visible."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import pytest
+
+from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics
+from sceneexpander.evaluation import comparison_table, scene_table
+
+
+def row(scene: str, method: str, psnr_db: float, **more: object) -> MetricsRow:
+    values: dict[str, object] = {
+        "scene": scene,
+        "round": 1,
+        "method": method,
+        "model": "made",
+        "weights_sha256": "",
+        "seed": 0,
+        "captured_views": 4,
+        "generated_views": 0,
+        "gaussians": 10,
+        "generated_gaussians": 0,
+        "psnr_db": psnr_db,
+        "ssim": 0.5,
+        "coverage": 1.0,
+    }
+    return MetricsRow(**{**values, **more})  # type: ignore[arg-type]
+
+
+def cells(table: str) -> list[list[str]]:
+    return list(csv.reader(io.StringIO(table)))
+
+
+def test_shape_and_means() -> None:
+    rows = [
+        row("b", "sceneexpander", 22.0, inserted_psnr_db=18.0, navigation_coverage=0.9),
+        row("a", "sceneexpander", 20.0, inserted_psnr_db=17.0, navigation_coverage=0.8),
+        row("a", "captured", 25.0, navigation_coverage=0.5),
+        row("b", "captured", 26.0, navigation_coverage=0.7),
+        row("a", "backbone", 18.0, inserted_psnr_db=19.0, navigation_coverage=0.8),
+        row("b", "backbone", 19.0, inserted_psnr_db=19.0, navigation_coverage=0.8),
+    ]
+    header, *lines = cells(comparison_table(rows).csv())
+    assert header == [
+        "method", "cells of 2", "PSNR ↑", "SSIM ↑", "insertion PSNR ↑", "coverage ↑", "coverage gained ↑"
+    ]  # fmt: skip
+    assert lines == [
+        ["captured only (ceiling of preservation)", "2", "25.50", "0.500", "–", "0.600", "–"],
+        ["backbone with the inserted view, unadapted", "2", "18.50", "0.500", "19.00", "0.800", "0.200"],
+        ["SceneExpander", "2", "21.00", "0.500", "17.50", "0.850", "0.250"],
+    ]
+
+
+def test_gaps_are_shown_not_averaged_over() -> None:
+    rows = [
+        row("a", "captured", 25.0, navigation_coverage=0.5),
+        row("b", "captured", 15.0),
+        row("a", "sceneexpander", 20.0, navigation_coverage=0.9, truth=TruthMetrics(depth_abs_rel=0.1)),
+        row("c", "backbone", 18.0, navigation_coverage=0.9),
+    ]
+    header, *lines = cells(comparison_table(rows).csv())
+    table = {line[0].split()[0]: dict(zip(header, line, strict=True)) for line in lines}
+    assert table["captured"]["PSNR ↑"] == "20.00 (2/3)"
+    assert table["captured"]["coverage ↑"] == "0.500 (1/3)"
+    assert table["captured"]["depth AbsRel ↓"] == "missing"
+    assert table["SceneExpander"]["cells of 3"] == "1"
+    assert table["SceneExpander"]["depth AbsRel ↓"] == "0.100 (1/3)"
+    assert table["backbone"]["coverage gained ↑"] == "missing"  # nothing to compare with in scene c
+    assert "insertion PSNR ↑" not in header
+
+
+def test_scene_table_lists_absent_combinations() -> None:
+    rows = [row("a", "captured", 25.0), row("b", "sceneexpander", 20.0)]
+    _, *lines = cells(scene_table(rows).csv())
+    assert [line[0] for line in lines] == ["a", "a", "b", "b"]
+    assert [line[4] for line in lines] == ["25.00", "missing", "missing", "20.00"]
+
+
+def test_seeds_and_rounds_are_cells_of_their_own() -> None:
+    rows = [row("a", "captured", 20.0), row("a", "captured", 30.0, seed=1), row("a", "captured", 10.0, round=2)]
+    assert cells(comparison_table(rows).csv())[1][1:3] == ["3", "20.00"]
+    with pytest.raises(ValueError, match="two rows"):
+        comparison_table([*rows, rows[0]])
+
+
+def test_unknown_methods_come_last() -> None:
+    rows = [row("a", "zebra", 1.0), row("a", "other", 2.0), row("a", "sceneexpander", 3.0)]
+    assert [line[0] for line in cells(comparison_table(rows).csv())[1:]] == ["SceneExpander", "other", "zebra"]
+
+
+def test_markdown() -> None:
+    text = comparison_table([row("a", "odd|name", 25.0)]).markdown().splitlines()
+    assert text[1].startswith("| :-- | --: |")
+    assert text[2].startswith("| odd\\|name | 1 | 25.00 |")

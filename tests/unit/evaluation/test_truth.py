@@ -1,0 +1,189 @@
+"""Errors against known truth, with errors of known size put in."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.store import ArtifactError, sha256_of_file
+from sceneexpander.evaluation import SceneTruth, ViewTruth, against_truth, load_truth
+from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
+from sceneexpander.geometry.similarity import Similarity
+from tests.unit.evaluation.made import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
+
+EYES = (0.0, 0.4, 0.9, 2.0)
+
+
+def made(eyes: tuple[float, ...] = EYES) -> Reconstruction:
+    scene = made_reconstruction(eyes_x=eyes)
+    poses = scene.world_from_cam.clone()
+    if len(eyes) > 3:
+        poses[1, 1, 3] = 0.3  # off the line
+    return dataclasses.replace(scene, world_from_cam=poses)
+
+
+def truth_of(scene: Reconstruction) -> SceneTruth:
+    """The reconstruction's own values as truth; the right half of the last view is new."""
+    new_region = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    new_region[:, WIDTH // 2 :] = True
+    last = len(scene.view_ids) - 1
+    return SceneTruth(
+        views={
+            f"hash{i}": ViewTruth(
+                world_from_cam=scene.world_from_cam[i].double(),
+                intrinsics_px=scene.intrinsics_px[i].double(),
+                depth=scene.depth[i],
+                new_region=new_region if i == last else None,
+            )
+            for i in range(last + 1)
+        }
+    )
+
+
+def test_truth_itself_has_no_error() -> None:
+    scene = made()
+    found = against_truth(scene, own_pictures(scene), truth_of(scene))
+    for name, value in dataclasses.asdict(found).items():
+        expected = 1.0 if name.endswith("within_125") else 0.0
+        assert value == pytest.approx(expected, abs=1e-5), name
+
+
+def test_frame_and_scale_do_not_count() -> None:
+    scene = made()
+    rotation = rotation_from_quat_wxyz(torch.tensor([0.8, -0.2, 0.4, 0.1]))
+    moved = Similarity(scale=3.0, rotation=rotation, translation=torch.tensor([1.0, 2.0, -1.0]))
+    other = dataclasses.replace(scene, world_from_cam=moved.poses(scene.world_from_cam), depth=scene.depth * 3)
+    found = against_truth(other, own_pictures(scene), truth_of(scene))
+    assert found.camera_rotation_deg == pytest.approx(0, abs=1e-4)
+    # float32 poses: an angle of 1e-7 rad between directions is what rounding alone gives.
+    assert found.camera_direction_deg == pytest.approx(0, abs=1e-3)
+    assert found.camera_ate == pytest.approx(0, abs=1e-5)
+    assert found.depth_abs_rel == pytest.approx(0, abs=1e-5)
+    assert found.new_region_abs_rel == pytest.approx(0, abs=1e-5)
+
+
+def test_a_turned_inserted_camera() -> None:
+    scene = made()
+    angle = math.radians(5)
+    turn = torch.eye(4)
+    turn[:3, :3] = rotation_from_quat_wxyz(torch.tensor([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0]))
+    poses = scene.world_from_cam.clone()
+    poses[-1] = poses[-1] @ turn
+    found = against_truth(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
+    assert found.inserted_rotation_deg == pytest.approx(5, abs=1e-3)
+    assert found.inserted_direction_deg == pytest.approx(0, abs=1e-3)
+    assert found.camera_rotation_deg == pytest.approx(0, abs=1e-4)
+
+
+def test_a_moved_camera() -> None:
+    scene = made(eyes=(0.0, 1.0))
+    poses = scene.world_from_cam.clone()
+    poses[1, :3, 3] = torch.tensor([1.0, 1.0, 0.0])
+    scene = dataclasses.replace(scene, generated=torch.zeros(2, dtype=torch.bool))
+    found = against_truth(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
+    assert found.camera_direction_deg == pytest.approx(45, abs=1e-4)
+    assert found.camera_ate is None  # two cameras always fit
+    poses[1, :3, 3] = 0
+    found = against_truth(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
+    assert found.camera_direction_deg == 90
+
+
+def test_depth_errors_of_known_size() -> None:
+    scene = made()
+    depth = scene.depth.clone()
+    depth[-1, :, WIDTH // 2 :] *= 1.5
+    found = against_truth(dataclasses.replace(scene, depth=depth), own_pictures(scene), truth_of(scene))
+    assert found.depth_abs_rel == pytest.approx(0, abs=1e-6)
+    assert found.new_region_abs_rel == pytest.approx(0.5, abs=1e-5)
+    assert found.new_region_within_125 == 0
+
+
+def test_unknown_pixels_and_views_are_left_out() -> None:
+    scene = made()
+    truth = truth_of(scene)
+    holes = scene.depth[0].clone()
+    holes[:20] = 0
+    views = {**truth.views, "hash0": dataclasses.replace(truth.views["hash0"], depth=holes)}
+    del views["hash3"]
+    wrong = scene.depth.clone()
+    wrong[0, :20] = 50.0  # where nothing is known
+    found = against_truth(dataclasses.replace(scene, depth=wrong), own_pictures(scene), SceneTruth(views=views))
+    assert found.depth_abs_rel == pytest.approx(0, abs=1e-6)
+    assert found.inserted_rotation_deg is None
+    assert found.new_region_abs_rel is None
+    nothing = against_truth(scene, own_pictures(scene), SceneTruth())
+    assert set(dataclasses.asdict(nothing).values()) == {None}
+
+
+def test_truth_is_brought_to_stored_pixels() -> None:
+    scene = made(eyes=(0.0, 1.0))
+    scene = dataclasses.replace(scene, generated=torch.zeros(2, dtype=torch.bool))
+    views = own_pictures(scene)
+    # The originals were twice as large, with a border of 4 that was cropped on the left.
+    records = tuple(
+        dataclasses.replace(
+            record,
+            original_height=2 * HEIGHT,
+            original_width=2 * WIDTH + 4,
+            stored_from_original=((0.5, 0.0, -2.0), (0.0, 0.5, 0.0)),
+        )
+        for record in views.records
+    )
+    original = torch.full((2 * HEIGHT, 2 * WIDTH + 4), DEPTH)
+    original[:, :4] = 99.0
+    truth = truth_of(scene)
+    large = {key: dataclasses.replace(value, depth=original, new_region=None) for key, value in truth.views.items()}
+    found = against_truth(scene, dataclasses.replace(views, records=records), SceneTruth(views=large))
+    assert found.depth_abs_rel == pytest.approx(0, abs=1e-6)
+    assert found.depth_within_125 == 1
+    with pytest.raises(ArtifactError, match="truth of 56 x 88 pixels"):
+        against_truth(scene, views, SceneTruth(views=large))
+
+
+def test_truth_folder(tmp_path: Path) -> None:
+    assert load_truth(tmp_path) is None
+    for part in ("captured", "inserted", "truth/depth"):
+        (tmp_path / part).mkdir(parents=True)
+    files = ("captured/a.png", "inserted/round_1.png")
+    for index, name in enumerate(files):
+        Image.fromarray(np.full((4, 6, 3), index, np.uint8)).save(tmp_path / name)
+    for name, depth in (("a", 1500), ("inserted", 2500)):
+        Image.fromarray(np.full((4, 6), depth, np.uint16)).save(tmp_path / "truth" / "depth" / f"{name}.png")
+    mask = np.zeros((4, 6), np.uint8)
+    mask[:, 3:] = 255
+    Image.fromarray(mask).save(tmp_path / "truth" / "new_region.png")
+    cameras = [{"file": name, "world_from_cam": np.eye(4).tolist()} for name in files]
+    content = {"intrinsics_px": np.eye(3).tolist(), "captured": cameras[:1], "inserted": cameras[1]}
+    path = tmp_path / "truth" / "cameras.json"
+    path.write_text(json.dumps(content))
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    captured, inserted = (truth.views[sha256_of_file(tmp_path / name)] for name in files)
+    assert captured.depth is not None
+    assert inserted.depth is not None
+    assert inserted.new_region is not None
+    assert captured.new_region is None
+    assert (float(captured.depth[0, 0]), float(inserted.depth[0, 0])) == pytest.approx((1.5, 2.5))
+    assert inserted.new_region[0].tolist() == [False] * 3 + [True] * 3
+    damages = (
+        {"intrinsics_px": [1, 2]},
+        {"captured": [{**cameras[0], "file": "captured/none.png"}]},
+        {"captured": [{**cameras[0], "world_from_cam": np.full((4, 4), 1e400).tolist()}]},
+        {"captured": 3},
+    )
+    for damage in damages:
+        path.write_text(json.dumps({**content, **damage}))
+        with pytest.raises(ArtifactError, match="is invalid"):
+            load_truth(tmp_path)
+    path.write_text(json.dumps(content))
+    Image.fromarray(mask).save(tmp_path / "truth" / "depth" / "a.png")
+    with pytest.raises(ArtifactError, match="not a 16-bit"):
+        load_truth(tmp_path)

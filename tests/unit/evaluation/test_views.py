@@ -1,0 +1,154 @@
+"""Preservation, insertion and coverage on a made scene whose right answers are known."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.store import ArtifactError
+from sceneexpander.errors import UserError
+from sceneexpander.evaluation import EvaluateConfig, Navigation, evaluate, navigation_coverage, same_place
+from sceneexpander.evaluation.image import psnr
+from sceneexpander.evaluation.views import PSNR_CAP_DB, insertion_fidelity, preservation
+from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
+from sceneexpander.geometry.similarity import Similarity
+from tests.unit.evaluation.made import HEIGHT, WIDTH, made_reconstruction, own_pictures, without_generated
+
+CONFIG = EvaluateConfig()
+
+
+def test_a_perfect_reconstruction() -> None:
+    scene = made_reconstruction()
+    views = own_pictures(scene)
+    captured, inserted = preservation(scene, views, CONFIG), insertion_fidelity(scene, views, CONFIG)
+    assert [row.view_id for row in captured] == ["000", "001"]
+    assert [row.view_id for row in inserted] == ["002"]
+    for row in (*captured, *inserted):
+        assert row.psnr_db == PSNR_CAP_DB
+        assert row.ssim == pytest.approx(1, abs=1e-9)
+        assert row.coverage > 0.95
+        assert row.depth_disagreement == pytest.approx(0, abs=1e-5)  # every centre is at depth 3 exactly
+    # From 0 the inserted view's part of the wall is hardly seen; from 2.2 about 60 % is seen by no captured view.
+    assert captured[0].generated_share < 0.05
+    assert inserted[0].generated_share == pytest.approx(0.6, abs=0.06)
+    assert (captured[0].others_coverage or 0) > 0.8
+    assert (captured[0].others_psnr_db or 0) > 25
+
+
+def test_views_are_matched_by_id_not_by_place() -> None:
+    scene = made_reconstruction()
+    views = own_pictures(scene).select([2, 1, 0])
+    assert all(row.psnr_db == PSNR_CAP_DB for row in preservation(scene, views, CONFIG))
+    with pytest.raises(ValueError, match="no picture of view '001'"):
+        preservation(scene, views.select([0, 2]), CONFIG)
+
+
+def test_a_damaged_picture_costs_what_it_must() -> None:
+    scene = made_reconstruction()
+    views = own_pictures(scene)
+    images = views.images.clone()
+    images[0] = (images[0] * 0.5).clamp(0, 1)
+    damaged = dataclasses.replace(views, images=images)
+    rows = preservation(scene, damaged, CONFIG)
+    assert rows[0].psnr_db == pytest.approx(psnr(views.images[0], images[0]), abs=1e-4)
+    assert rows[1].psnr_db == PSNR_CAP_DB
+
+
+def test_ghosting_is_noticed_only_by_the_cross_view_number() -> None:
+    """Shifted copies behind each view's own surface leave the view itself nearly untouched."""
+    good = made_reconstruction(generated_last=False)
+    views = own_pictures(good)
+    moved = good.gaussians.means.clone()
+    moved[good.gaussians.source_view == 1] += torch.tensor([0.5, 0.0, 0.5])
+    ghosted = dataclasses.replace(good, gaussians=dataclasses.replace(good.gaussians, means=moved))
+    before, after = preservation(good, views, CONFIG)[0], preservation(ghosted, views, CONFIG)[0]
+    assert after.psnr_db > 20
+    assert (after.others_psnr_db or 0) < (before.others_psnr_db or 0) - 5
+
+
+def test_one_view_has_no_others() -> None:
+    scene = made_reconstruction(eyes_x=(0.0,), generated_last=False)
+    row = preservation(scene, own_pictures(scene), CONFIG)[0]
+    assert row.others_psnr_db is None
+    assert row.others_coverage is None
+
+
+def test_coverage_gained_by_the_expansion() -> None:
+    scene = made_reconstruction()
+    before = without_generated(scene)
+    poses, intrinsics = scene.world_from_cam[2:], scene.intrinsics_px[2:]
+    after_share = navigation_coverage(scene, poses, intrinsics, HEIGHT, WIDTH, CONFIG)
+    before_share = navigation_coverage(before, poses, intrinsics, HEIGHT, WIDTH, CONFIG)
+    # Each view spans 3.15 of the wall; seen from 2.2, the view from 0.3 reaches (3.15 - 1.9) / 3.15 = 40 % of it.
+    assert float(before_share[0]) == pytest.approx(0.4, abs=0.06)
+    assert float(after_share[0]) > 0.95
+
+
+def test_same_place_in_another_gauge() -> None:
+    scene = made_reconstruction()
+    rotation = rotation_from_quat_wxyz(torch.tensor([0.9, 0.1, -0.3, 0.2]))
+    other_from_scene = Similarity(scale=1.7, rotation=rotation, translation=torch.tensor([0.3, -2.0, 1.0]))
+    other = dataclasses.replace(
+        without_generated(scene),
+        world_from_cam=other_from_scene.poses(scene.world_from_cam[:2]),
+        depth=scene.depth[:2] * 1.7,
+    )
+    found = same_place(scene.world_from_cam, scene, other)
+    torch.testing.assert_close(found, other_from_scene.poses(scene.world_from_cam), atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match="share no captured view"):
+        same_place(scene.world_from_cam, scene, dataclasses.replace(other, view_ids=("a", "b")))
+
+
+def test_sizes_must_agree() -> None:
+    scene = made_reconstruction()
+    views = own_pictures(scene)
+    smaller = dataclasses.replace(views, images=views.images[:, :, :14])
+    with pytest.raises(ValueError, match="pixels"):
+        preservation(scene, smaller, CONFIG)
+
+
+def test_row_holds_everything_and_survives_the_disk(tmp_path: Path) -> None:
+    scene = made_reconstruction()
+    navigation = Navigation(
+        world_from_cam=scene.world_from_cam, intrinsics_px=scene.intrinsics_px, height=HEIGHT, width=WIDTH
+    )
+    row = evaluate(scene, own_pictures(scene), CONFIG, scene="made", round_number=1, seed=0, navigation=navigation)
+    assert (row.captured_views, row.generated_views, row.navigation_frames) == (2, 1, 3)
+    assert row.gaussians == 3 * HEIGHT * WIDTH
+    assert row.generated_gaussians == HEIGHT * WIDTH
+    assert row.inserted_psnr_db == PSNR_CAP_DB
+    assert row.truth is None
+    assert row.numbers()["psnr_db"] == PSNR_CAP_DB
+    assert "torch" in row.versions
+    row.save(tmp_path / "m.json")
+    assert MetricsRow.load(tmp_path / "m.json") == row
+    (tmp_path / "m.json").write_text('{"schema": "metrics/1", "scene": "x"}')
+    with pytest.raises(ArtifactError, match="is invalid"):
+        MetricsRow.load(tmp_path / "m.json")
+    (tmp_path / "m.json").write_text('{"schema": "other/1"}')
+    with pytest.raises(ArtifactError, match="is not of schema"):
+        MetricsRow.load(tmp_path / "m.json")
+
+
+def test_captured_only_row() -> None:
+    scene = made_reconstruction()
+    row = evaluate(without_generated(scene), own_pictures(scene), CONFIG, scene="m", round_number=1, seed=0)
+    assert row.method == "captured"
+    assert row.inserted_psnr_db is None
+    assert row.navigation_coverage is None
+
+
+def test_non_finite_numbers_are_refused() -> None:
+    scene = made_reconstruction()
+    row = evaluate(scene, own_pictures(scene), CONFIG, scene="m", round_number=1, seed=0)
+    with pytest.raises(ValueError, match="psnr_db is inf"):
+        dataclasses.replace(row, psnr_db=float("inf"))
+
+
+def test_config_range() -> None:
+    with pytest.raises(UserError, match="coverage_alpha"):
+        EvaluateConfig(coverage_alpha=1.0)
