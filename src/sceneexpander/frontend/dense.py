@@ -70,7 +70,7 @@ class DenseConfig:
     min_part_px: int = 20  # smaller confident islands are dropped (at 320 pixels; scaled by area)
     segment_tolerances: tuple[float, ...] = (0.8, 2.0)  # colour segments, fine and coarse
     min_segment_px: int = 40  # smallest segment (at 320 pixels; scaled by area)
-    plane_tolerance: float = 0.05  # relative error at which a sample stops supporting a segment's plane
+    plane_tolerance: float = 0.1  # relative error at which a sample stops supporting a segment's plane
     min_plane_support: float = 0.35  # planes with less support are not used
     plane_weights: tuple[float, ...] = (0.3, 0.12)  # weight of a fully supported plane in the final fill, per scale
     smooth_reach: float = 0.054  # reach of the final fill as a share of the long side
@@ -79,7 +79,7 @@ class DenseConfig:
     weight_agreed: float = 1.0  # confident, two or more other views agree
     weight_confident: float = 0.6  # confident, one other view agrees
     weight_raw: float = 0.001  # matched but not confident
-    weight_point: float = 10.0  # sparse points
+    weight_point: float = 30.0  # sparse points
     weight_interpolation: float = 0.003  # interpolation of the sparse points
 
 
