@@ -1,0 +1,66 @@
+# make repro: the bundled scene, end to end.  make test: every check.  Both set the environment up first.
+SHELL := /bin/bash
+.ONESHELL:
+.SHELLFLAGS := -eu -o pipefail -c
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PY := .venv/bin/python
+export PATH := $(CURDIR)/.venv/bin:$(PATH)
+export SCENEEXPANDER_ROOT := $(CURDIR)
+export MLFLOW_DISABLE_TELEMETRY := true
+export MLFLOW_SERVER_ENABLE_JOB_EXECUTION := false
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: repro test test-unit test-conformance test-pipeline lint setup ui expand ablate mini-scores clean help
+
+help: ## What there is
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
+
+repro: .venv/.stamp ## Run the pipeline on the scenes in params.yaml
+	$(PY) -m stages.check
+	dvc repro
+	@echo "report: $(CURDIR)/outputs/report/index.html"
+
+setup: .venv/.stamp ## Make .venv from requirements.lock
+
+# The lock is installed as it is; the package itself without dependencies (it builds an optional extension).
+.venv/.stamp: requirements.lock pyproject.toml
+	test -x $(PY) || $(PYTHON) -m venv .venv
+	$(PY) -m pip install --quiet --no-compile -r requirements.lock
+	$(PY) -m pip install --quiet --no-compile --no-deps --no-build-isolation -e .
+	touch $@
+
+test: lint test-unit test-conformance test-pipeline ## Every check
+
+lint: .venv/.stamp ## Style and types
+	ruff check .
+	ruff format --check .
+	mypy
+
+test-unit: .venv/.stamp
+	OMP_NUM_THREADS=1 pytest tests/unit -n 2
+
+test-conformance: .venv/.stamp
+	pytest tests/conformance
+
+test-pipeline: .venv/.stamp
+	pytest tests/pipeline
+
+ui: .venv/.stamp ## Runs in the browser (loopback only)
+	$(PY) -m sceneexpander.tracking.ui
+
+# make expand PHOTOS=folder INSERTED=picture.png PROMPT="Behind the table is a bench."
+# The values reach the shell as environment variables, so quotes in a sentence need no escaping.
+export PHOTOS INSERTED PROMPT NAME
+expand: .venv/.stamp ## Expand your own photos: PHOTOS=, INSERTED=, PROMPT=, NAME=, ARGS=
+	@test -n "$$PHOTOS" || { echo 'error: PHOTOS: is missing; make expand PHOTOS=folder INSERTED=picture PROMPT="..."' >&2; exit 2; }
+	$(PY) -m sceneexpander.expand "$$PHOTOS" $(if $(INSERTED),--inserted "$$INSERTED") $(if $(PROMPT),--prompt "$$PROMPT") $(if $(NAME),--name "$$NAME") $(ARGS)
+
+ablate: .venv/.stamp ## The rows of the paper's ablation table, as one sweep
+	$(PY) -m sceneexpander.sweep --multirun ablation=baseline,anchor,subset_aug,self_distill,self_distill_p1,full
+
+mini-scores: .venv/.stamp ## Errors of the embedded reconstructor on made scenes
+	$(PY) benchmarks/mini_scores.py
+
+clean: ## Remove outputs and caches of tools (keeps .venv, the pipeline's cache, mlflow and runs)
+	rm -rf outputs .pytest_cache .mypy_cache .ruff_cache .hypothesis build
+	find src stages tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,61 @@
+"""Everything that can be wrong with the user's input, found before anything runs: an earlier result is then never replaced."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+from sceneexpander.config.compose import compose, scene_option
+from sceneexpander.config.parse import parse_dataclass
+from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.errors import UserError
+from sceneexpander.expansion import ModelConfig, load_model
+from sceneexpander.generation import generate_inserted_view
+from sceneexpander.ingest import load_scene
+
+
+def check_scene(name: str, folder: Path, *, conf: Path, overrides: Sequence[str], rounds: int | None = None) -> int:
+    """Compose the configuration for a scene and read all of its pictures; nothing is written.
+
+    Args:
+        name: of the scene; selects its own option in ``conf/scene`` if there is one.
+        folder: the scene folder, with scene.yaml.
+        conf: the configuration folder.
+        overrides: Hydra overrides.
+        rounds: how many rounds are to run; None: all that the scene defines.
+
+    Returns:
+        the number of rounds.
+
+    Raises:
+        UserError: one line about the first problem found.
+    """
+    config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
+    check_device(config.device)
+    scene = load_scene(folder, config.scene)
+    count = len(scene.rounds) if rounds is None else rounds
+    for number in range(1, count + 1):
+        generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
+    check_weights(config.model)
+    return count
+
+
+def check_device(device: str) -> None:
+    """Raise `UserError` if the device is not there."""
+    import torch
+
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"is {device!r}, but no CUDA device is available", where="device", fix="use device=cpu")
+
+
+def check_weights(config: ModelConfig) -> None:
+    """Load the weights once, so that a file that is missing or does not fit is refused here.
+
+    Weights on a hub are left to the stage that downloads them.
+    """
+    if "@" in config.weights and not Path(config.weights).exists():
+        if importlib.util.find_spec("huggingface_hub") is None:
+            raise UserError("names a hub, but huggingface-hub is not installed", where="model.weights")
+        return
+    load_model(config, "cpu")

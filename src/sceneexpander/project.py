@@ -1,0 +1,29 @@
+"""Where the project is, whichever folder or workspace a program runs in."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from sceneexpander.errors import UserError
+
+ROOT_ENV = "SCENEEXPANDER_ROOT"  # set in workspaces: the main project folder, which they share
+ERROR_FILE_ENV = (
+    "SCENEEXPANDER_ERROR_FILE"  # set by whoever starts a pipeline: where a stage leaves its one-line refusal
+)
+
+
+def find_project() -> Path:
+    """The project folder: named by the environment, or the nearest one above the current folder, or the one of this installation.
+
+    Raises:
+        UserError: none of them holds a pipeline.
+    """
+    named = os.environ.get(ROOT_ENV)
+    if named:
+        return Path(named).resolve()
+    here = Path.cwd().resolve()
+    for folder in (here, *here.parents, Path(__file__).resolve().parents[2]):
+        if (folder / "dvc.yaml").is_file() and (folder / "conf" / "config.yaml").is_file():
+            return folder
+    raise UserError("holds no pipeline (dvc.yaml and conf/)", where=here, fix="run this in the project folder")

@@ -1,0 +1,205 @@
+"""Gather what is shown of one scene into one folder: pictures, videos and a single file of facts."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from torch import Tensor
+
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.renders import Renders
+from sceneexpander.artifacts.scene import Scene
+from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
+from sceneexpander.artifacts.views import ViewSet, to_uint8
+from sceneexpander.report.camera_map import camera_map
+
+FACTS = "page.json"
+_PICTURE_SIDE_PX = 480
+_LOSSES = ("loss", "anchor_camera", "anchor_depth", "anchor_normal", "gen_camera", "gen_depth", "gen_normal", "drift")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MethodSource:
+    """Artefacts of one method in one round."""
+
+    name: str
+    reconstruction: Path
+    renders: Path
+    metrics: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoundSource:
+    """Artefacts of one round. ``log`` is the adaptation's, ``statistics`` holds one file per stage run."""
+
+    number: int
+    inserted: Path
+    methods: Sequence[MethodSource]
+    log: Path
+    statistics: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneSource:
+    """Artefacts of one scene. ``report`` is what the first reconstruction said about itself."""
+
+    scene: Path
+    report: Path
+    statistics: Path
+    rounds: Sequence[RoundSource]
+    config: Mapping[str, Any]
+    overrides: Sequence[str]
+
+
+def collect_scene(source: SceneSource, folder: Path) -> None:
+    """Fill ``folder`` with ``page.json`` and the media it names (paths relative to the folder).
+
+    Raises:
+        ArtifactError: an artefact is missing or damaged.
+    """
+    scene = Scene.load(source.scene)
+    facts: dict[str, Any] = {
+        "scene": scene.name,
+        "rounds_defined": len(scene.rounds),
+        "config": dict(source.config),
+        "overrides": list(source.overrides),
+        "model": read_json(source.report),
+        "captured": _captured(scene.views, folder),
+        "statistics": _statistics(source.statistics),
+        "rounds": [_round(item, scene, folder) for item in source.rounds],
+    }
+    write_json_atomic(folder / FACTS, facts)
+
+
+def _captured(views: ViewSet, folder: Path) -> list[dict[str, Any]]:
+    entries = []
+    for record, image in zip(views.records, views.images, strict=True):
+        picture = f"captured/{record.view_id}.jpg"
+        _save_picture(folder / picture, image)
+        entries.append(
+            {
+                "id": record.view_id,
+                "name": record.name,
+                "original": [record.original_width, record.original_height],
+                "sha256": record.sha256,
+                "picture": picture,
+            }
+        )
+    return entries
+
+
+def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
+    inserted = InsertedView.load(source.inserted)
+    chosen = inserted.provenance[inserted.chosen]
+    base = f"round_{source.number}"
+    _save_picture(folder / base / "inserted.jpg", inserted.view.images[0])
+    sheet = source.inserted / "sheet.png"
+    if sheet.is_file():
+        shutil.copyfile(sheet, folder / base / "sheet.png")
+    spec = scene.round_spec(source.number)
+    log = read_json(source.log)
+    methods = [_method(item, folder, f"{base}/{item.name}") for item in source.methods]
+    return {
+        "number": source.number,
+        "prompt": spec.prompt,
+        "motion": spec.motion,
+        "object": spec.new_object,
+        "full_prompt": chosen.prompt,
+        "backend": chosen.backend,
+        "origin": Path(chosen.source).name,
+        "parameters": chosen.parameters,
+        "candidates": len(inserted.provenance),
+        "inserted": f"{base}/inserted.jpg",
+        "inserted_id": inserted.view.view_ids[0],
+        "sheet": f"{base}/sheet.png" if sheet.is_file() else None,
+        "methods": methods,
+        "series": {name: [record[name] for record in log] for name in _LOSSES if log and name in log[0]},
+        "statistics": _statistics(source.statistics),
+        "warnings": _warnings(methods, chosen.parameters),
+    }
+
+
+def _method(source: MethodSource, folder: Path, base: str) -> dict[str, Any]:
+    renders = Renders.load(source.renders)
+    reconstruction = Reconstruction.load(source.reconstruction)
+    target = folder / base
+    target.mkdir(parents=True, exist_ok=True)
+    videos = {
+        layer: _copy(source.renders / name, folder, f"{base}/{layer}.mp4") for layer, name in renders.videos.items()
+    }
+    stills = [
+        {
+            "frame": index,
+            **{
+                layer: _copy(source.renders / name, folder, f"{base}/{layer}_{index:04d}{Path(name).suffix}")
+                for layer, name in pictures.items()
+            },
+        }
+        for index, pictures in renders.stills
+    ]
+    views = {
+        view: _copy(source.renders / name, folder, f"{base}/view_{view}{Path(name).suffix}")
+        for view, name in renders.views
+    }
+    return {
+        "name": source.name,
+        "model": reconstruction.model,
+        "weights_sha256": reconstruction.weights_sha256,
+        "views": [
+            {"id": view, "generated": bool(generated), "posed": bool(posed)}
+            for view, generated, posed in zip(
+                reconstruction.view_ids, reconstruction.generated, reconstruction.posed, strict=True
+            )
+        ],
+        "videos": videos,
+        "stills": stills,
+        "view_pictures": views,
+        "frames": renders.frames,
+        "fps": renders.fps,
+        "inserted_frame": renders.inserted_frame,
+        "inserted_camera": renders.inserted_camera,
+        "width": renders.width,
+        "height": renders.height,
+        "gaussians": renders.gaussians,
+        "metrics": _copy(source.metrics, folder, f"{base}/metrics.json"),
+        "map": camera_map(reconstruction),
+    }
+
+
+def _warnings(methods: Sequence[Mapping[str, Any]], parameters: Mapping[str, str]) -> list[str]:
+    found = []
+    for method in methods:
+        lost = [view["id"] for view in method["views"] if not view["posed"]]
+        if lost:
+            found.append(
+                f"{method['name']}: no camera could be estimated for {', '.join(lost)}; a placeholder was used."
+            )
+    if parameters.get("warning"):
+        found.append(f"Inserted picture: {parameters['warning']}.")
+    return found
+
+
+def _statistics(folder: Path) -> dict[str, Any]:
+    return {path.stem: read_json(path) for path in sorted(folder.glob("*.json"))} if folder.is_dir() else {}
+
+
+def _copy(source: Path, folder: Path, place: str) -> str:
+    if not source.is_file():
+        raise ArtifactError("is missing", where=source, fix="rerun the stage that makes it")
+    target = folder / place
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+    return place
+
+
+def _save_picture(path: Path, image: Tensor) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = Image.fromarray(to_uint8(image))
+    picture.thumbnail((_PICTURE_SIDE_PX, _PICTURE_SIDE_PX))
+    picture.save(path, format="JPEG", quality=88)

@@ -1,0 +1,38 @@
+"""``python -m sceneexpander.tracking.ui``: MLflow's interface over the local store, on loopback only."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+
+from sceneexpander.errors import UserError, entry_point
+from sceneexpander.project import find_project
+from sceneexpander.tracking.config import TrackingConfig
+from sceneexpander.tracking.store import database_path, quiet_environment, tracking_uri
+
+
+@entry_point
+def main() -> None:
+    """Start the server and print a link that opens the charts."""
+    parser = argparse.ArgumentParser(prog="python -m sceneexpander.tracking.ui", description=__doc__)
+    parser.add_argument("--port", type=int, default=5000)
+    port = parser.parse_args().port
+    root = find_project()
+    if not database_path(root).is_file():
+        raise UserError("does not exist yet", where=database_path(root), fix="run `make repro` first")
+    quiet_environment()
+    # The landing page is about something else; experiment 1 is the first one made after MLflow's own default.
+    base = f"http://127.0.0.1:{port}/#/experiments/1/runs?workflowType=machine_learning&compareRunsMode="
+    print(f"charts:   {base}CHART\npictures: {base}ARTIFACT", flush=True)
+    command = [sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port)]
+    command += ["--backend-store-uri", tracking_uri(TrackingConfig(), root)]
+    try:
+        raise SystemExit(subprocess.call(command, cwd=root, env=dict(os.environ)))
+    except KeyboardInterrupt:
+        raise SystemExit(0) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""One thin file per pipeline stage: read the declared sections and artefacts, call the library once, save."""

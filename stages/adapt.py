@@ -1,0 +1,78 @@
+"""adapt: Algorithm 1. The weights learn to explain the inserted view without forgetting the captured ones."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.adaptation.loop import StepRecord
+from sceneexpander.artifacts.anchors import Anchors
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.state import ExpansionState, load_priors
+from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.config.files import read_sections
+from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, load_model
+from sceneexpander.progress import progress_bar
+from stages import layout
+from stages.runner import Cell, checkpoint_folder, remove_folder, stage, use_threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sections:
+    """What this stage reads of the configuration."""
+
+    seed: int
+    device: str
+    threads: int
+    model: ModelConfig
+    adapt: AdaptConfig
+
+
+def identity(sections: Sections, inputs: tuple[Path, ...]) -> str:
+    """Key of the resume points: configuration and input bytes. Another run never finds them."""
+    digest = hashlib.sha256(repr(sections).encode())
+    for folder in inputs:
+        for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+            digest.update(f"{path.as_posix()}\n".encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:32]
+
+
+@stage("scene", "round", "previous")
+def main(cell: Cell) -> None:
+    """Adapt, reconstruct with the adapted weights, and keep the log."""
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_threads(sections.threads)
+    sources = (
+        layout.state(cell.scene, cell.previous),
+        layout.inserted(cell.scene, cell.round),
+        layout.anchors(cell.scene, cell.round),
+        layout.joint_priors(cell.scene, cell.round),
+    )
+    inputs = RoundInputs(
+        state=ExpansionState.load(sources[0]),
+        inserted=InsertedView.load(sources[1]),
+        anchors=Anchors.load(sources[2]),
+        joint_priors=load_priors(sources[3]),
+    )
+    checkpoints = checkpoint_folder(identity(sections, sources))
+    loaded = load_model(sections.model, sections.device)
+    with progress_bar(f"adapt {cell.scene} round {cell.round}", sections.adapt.steps) as bar:
+
+        def on_step(record: StepRecord) -> None:
+            bar.update(record.step, record.loss)
+
+        state, reconstruction, result = adapt_round(
+            inputs, loaded, sections.adapt, seed=sections.seed, checkpoint_folder=checkpoints, on_step=on_step
+        )
+    with directory_being_written(layout.state(cell.scene, cell.round)) as folder:
+        state.save(folder)
+        reconstruction.save(folder / "reconstruction")
+        write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])
+    remove_folder(checkpoints)
+
+
+if __name__ == "__main__":
+    main()

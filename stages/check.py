@@ -1,0 +1,26 @@
+"""Not a stage: look at params.yaml, conf/ and the scene folders before the pipeline replaces anything. `make repro` starts with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sceneexpander.errors import UserError, entry_point
+from sceneexpander.preflight import check_scene
+from sceneexpander.workspace import read_selection
+from stages import layout
+from stages.resolve import CONF
+
+
+@entry_point
+def main() -> None:
+    """Raise the first problem as one line."""
+    selection = read_selection(Path())
+    unknown = sorted(set(selection.methods) - set(layout.METHODS))
+    if unknown:
+        raise UserError(f"unknown {unknown[0]!r}", where="params.yaml: methods", fix=f"use {', '.join(layout.METHODS)}")
+    for scene in selection.scenes:
+        check_scene(scene, layout.source(scene), conf=CONF, overrides=selection.overrides, rounds=selection.rounds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""collect: what the report and the tracking show of one scene, gathered in one folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.config.files import read_yaml
+from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene
+from stages import layout
+from stages.resolve import read_overrides
+from stages.runner import Cell, stage
+
+
+def _round(scene: str, number: int, methods: list[str]) -> RoundSource:
+    return RoundSource(
+        number=number,
+        inserted=layout.inserted(scene, number),
+        methods=[
+            MethodSource(
+                name=method,
+                reconstruction=layout.reconstruction(scene, number, method),
+                renders=layout.renders(scene, number, method),
+                metrics=layout.metrics(scene, number, method),
+            )
+            for method in methods
+        ],
+        log=layout.state(scene, number) / "log.json",
+        statistics=layout.round_folder(scene, number) / "stats",
+    )
+
+
+@stage("scene")
+def main(cell: Cell) -> None:
+    """List artefacts by what params.yaml selects: files of rounds or methods that were taken out may still lie there."""
+    selected: dict[str, Any] = read_yaml(Path("params.yaml"))
+    source = SceneSource(
+        scene=layout.prepared(cell.scene),
+        report=layout.state(cell.scene, 0) / "report.json",
+        statistics=layout.OUTPUTS / cell.scene / "stats",
+        rounds=[_round(cell.scene, item["k"], selected["methods"]) for item in selected["rounds"]],
+        config=read_yaml(layout.config(cell.scene)),
+        overrides=read_overrides(Path("params.yaml")),
+    )
+    with directory_being_written(layout.PAGES / cell.scene) as folder:
+        collect_scene(source, folder)
+
+
+if __name__ == "__main__":
+    main()

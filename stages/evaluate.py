@@ -1,0 +1,55 @@
+"""evaluate: the numbers of one method in one round."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.renders import Renders
+from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.config.files import read_sections
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.evaluate import Navigation, evaluate
+from sceneexpander.evaluation.truth import load_truth
+from stages import layout
+from stages.runner import Cell, stage, use_threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sections:
+    """What this stage reads of the configuration."""
+
+    seed: int
+    threads: int
+    evaluate: EvaluateConfig
+
+
+@stage("scene", "round", "previous", "method")
+def main(cell: Cell) -> None:
+    """Measure on the views of all rounds so far, on the tour, and against known truth where the scene has it."""
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_threads(sections.threads)
+    before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
+    views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
+    renders = Renders.load(layout.renders(cell.scene, cell.round, cell.method))
+    row = evaluate(
+        Reconstruction.load(layout.reconstruction(cell.scene, cell.round, cell.method)),
+        views,
+        sections.evaluate,
+        scene=cell.scene,
+        round_number=cell.round,
+        seed=sections.seed,
+        navigation=Navigation(
+            world_from_cam=renders.world_from_cam,
+            intrinsics_px=renders.intrinsics_px,
+            height=renders.height,
+            width=renders.width,
+        ),
+        truth=load_truth(layout.source(cell.scene)),
+    )
+    row.save(layout.metrics(cell.scene, cell.round, cell.method))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""Where artefacts live. The paths are the same in every workspace, because the pipeline's cache knows outputs by path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SCENES = Path("scenes")
+OUTPUTS = Path("outputs")
+PAGES = OUTPUTS / "pages"  # what is shown of every scene, gathered from its artefacts
+REPORT = OUTPUTS / "report"
+CODE = OUTPUTS / "code.json"
+METHODS = ("captured", "backbone", "sceneexpander")
+
+
+def source(scene: str) -> Path:
+    """The user's folder: photos, scene.yaml, recorded pictures."""
+    return SCENES / scene
+
+
+def config(scene: str) -> Path:
+    """The composed configuration."""
+    return OUTPUTS / scene / "config.yaml"
+
+
+def prepared(scene: str) -> Path:
+    """The `Scene` artefact."""
+    return OUTPUTS / scene / "scene"
+
+
+def round_folder(scene: str, number: int) -> Path:
+    """Everything of one round; round 0 is the captured scene."""
+    return OUTPUTS / scene / f"round_{number}"
+
+
+def state(scene: str, number: int) -> Path:
+    """The `ExpansionState` after a round."""
+    return round_folder(scene, number) / "sceneexpander"
+
+
+def reconstruction(scene: str, number: int, method: str) -> Path:
+    """The `Reconstruction` that a method made in a round."""
+    return round_folder(scene, number) / method / "reconstruction"
+
+
+def inserted(scene: str, number: int) -> Path:
+    """The `InsertedView` of a round."""
+    return round_folder(scene, number) / "inserted"
+
+
+def anchors(scene: str, number: int) -> Path:
+    """The `Anchors` of a round."""
+    return round_folder(scene, number) / "anchors"
+
+
+def joint_priors(scene: str, number: int) -> Path:
+    """`Priors` of all views, the inserted one included."""
+    return round_folder(scene, number) / "joint_priors"
+
+
+def renders(scene: str, number: int, method: str) -> Path:
+    """Videos and pictures of a method's reconstruction."""
+    return round_folder(scene, number) / "renders" / method
+
+
+def metrics(scene: str, number: int, method: str) -> Path:
+    """Metrics of a method's reconstruction."""
+    return round_folder(scene, number) / "metrics" / f"{method}.json"
+
+
+def statistics(stage: str, scene: str, number: int | None = None, method: str | None = None) -> Path:
+    """Wall time and memory of one stage run: apart from its results, which must repeat bit for bit."""
+    folder = OUTPUTS / scene if number is None else round_folder(scene, number)
+    return folder / "stats" / f"{'-'.join(part for part in (stage, method) if part)}.json"

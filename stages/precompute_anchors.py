@@ -1,0 +1,38 @@
+"""precompute_anchors: what the model believes before the insertion, once as anchors and once as a reconstruction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sceneexpander.artifacts.state import ExpansionState
+from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.config.files import read_sections
+from sceneexpander.expansion import ModelConfig, captured_prediction, load_model
+from stages import layout
+from stages.runner import Cell, stage, use_threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sections:
+    """What this stage reads of the configuration."""
+
+    device: str
+    threads: int
+    model: ModelConfig
+
+
+@stage("scene", "round", "previous")
+def main(cell: Cell) -> None:
+    """Predict all views so far, without augmentation, with the weights before the round."""
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_threads(sections.threads)
+    state = ExpansionState.load(layout.state(cell.scene, cell.previous))
+    anchors, reconstruction = captured_prediction(state, load_model(sections.model, sections.device))
+    with directory_being_written(layout.anchors(cell.scene, cell.round)) as folder:
+        anchors.save(folder)
+    with directory_being_written(layout.reconstruction(cell.scene, cell.round, "captured").parent) as folder:
+        reconstruction.save(folder / "reconstruction")
+
+
+if __name__ == "__main__":
+    main()

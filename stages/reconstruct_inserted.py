@@ -1,0 +1,44 @@
+"""reconstruct_inserted: the baseline. The unadapted model given the inserted view like any other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.state import ExpansionState, save_priors
+from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.config.files import read_sections
+from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_model
+from sceneexpander.frontend.prior import FrontendConfig
+from stages import layout
+from stages.runner import Cell, stage, use_threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sections:
+    """What this stage reads of the configuration."""
+
+    seed: int
+    device: str
+    threads: int
+    model: ModelConfig
+    frontend: FrontendConfig
+
+
+@stage("scene", "round", "previous")
+def main(cell: Cell) -> None:
+    """Cameras and depth of all views together, and the scene the unadapted model makes of them."""
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_threads(sections.threads)
+    state = ExpansionState.load(layout.state(cell.scene, cell.previous))
+    inserted = InsertedView.load(layout.inserted(cell.scene, cell.round))
+    loaded = load_model(sections.model, sections.device)
+    priors, reconstruction, _ = joint_reconstruction(state, inserted, loaded, sections.frontend, seed=sections.seed)
+    with directory_being_written(layout.joint_priors(cell.scene, cell.round)) as folder:
+        save_priors(folder, priors)
+    with directory_being_written(layout.reconstruction(cell.scene, cell.round, "backbone").parent) as folder:
+        reconstruction.save(folder / "reconstruction")
+
+
+if __name__ == "__main__":
+    main()

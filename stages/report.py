@@ -1,0 +1,45 @@
+"""report: the page to look at, and the headline numbers as a small file for version control."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
+from sceneexpander.config.files import read_yaml
+from sceneexpander.evaluation.table import comparison_table, scene_table
+from sceneexpander.report import write_page
+from stages import layout
+from stages.runner import Cell, stage
+
+RESULTS = Path("results/metrics.json")
+
+
+def _digits(value: float) -> float:
+    # Enough to compare, few enough that another machine's last bits do not show as a change.
+    return float(f"{value:.5g}")
+
+
+@stage()
+def main(_: Cell) -> None:
+    """Page, tables, numbers; scenes, rounds and methods as params.yaml lists them."""
+    selected: dict[str, Any] = read_yaml(Path("params.yaml"))
+    rows: list[MetricsRow] = []
+    numbers: dict[str, Any] = {}
+    for scene in selected["scenes"]:
+        for item in selected["rounds"]:
+            for method in selected["methods"]:
+                row = MetricsRow.load(layout.PAGES / scene / f"round_{item['k']}" / method / "metrics.json")
+                rows.append(row)
+                known = {name: _digits(value) for name, value in row.numbers().items()}
+                numbers.setdefault(scene, {}).setdefault(f"round_{item['k']}", {})[method] = known
+    with directory_being_written(layout.REPORT) as folder:
+        write_page([layout.PAGES / scene for scene in selected["scenes"]], folder)
+        write_bytes_atomic(folder / "comparison.md", comparison_table(rows).markdown().encode())
+        write_bytes_atomic(folder / "scenes.csv", scene_table(rows).csv().encode())
+    write_json_atomic(RESULTS, numbers)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""What every stage shares: its arguments, its sections of the configuration, its bookkeeping, and how it fails."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import logging
+import os
+import platform
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
+from sceneexpander.errors import EXIT_BAD_INPUT, UserError
+from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV
+from stages import layout
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """Which part of the fan-out a stage run works on."""
+
+    scene: str = ""
+    round: int = 0
+    previous: int = 0
+    method: str = ""
+
+
+def project_root() -> Path:
+    """The main project folder, which all workspaces share for checkpoints and tracking."""
+    return Path(os.environ.get(ROOT_ENV, ".")).resolve()
+
+
+def checkpoint_folder(key: str) -> Path:
+    """Where an unfinished adaptation of this identity keeps its resume points."""
+    return project_root() / ".cache" / "ckpt" / key
+
+
+def stage(*axes: str) -> Callable[[Callable[[Cell], None]], Callable[[], None]]:
+    """Make a stage's body its command line: positional arguments for ``axes``, statistics, one-line errors.
+
+    Args:
+        axes: of ``scene``, ``round``, ``previous``, ``method``, in command-line order.
+    """
+
+    def decorate(body: Callable[[Cell], None]) -> Callable[[], None]:
+        name = body.__module__ if body.__module__ != "__main__" else Path(sys.argv[0]).stem
+        name = name.rpartition(".")[2]
+
+        @functools.wraps(body)
+        def main() -> None:
+            cell = _parse(name, axes)
+            logging.basicConfig(level=logging.INFO, format=f"%(levelname)s {name}: %(message)s")
+            try:
+                with _measured(_statistics_path(name, axes, cell)):
+                    body(cell)
+            except UserError as error:
+                print(f"error: {error.line()}", file=sys.stderr, flush=True)
+                if ERROR_FILE_ENV in os.environ:
+                    write_bytes_atomic(Path(os.environ[ERROR_FILE_ENV]), f"{error.line()}\n".encode())
+                raise SystemExit(EXIT_BAD_INPUT) from None
+
+        return main
+
+    return decorate
+
+
+def _parse(name: str, axes: tuple[str, ...]) -> Cell:
+    parser = argparse.ArgumentParser(prog=f"python -m stages.{name}")
+    for axis in axes:
+        parser.add_argument(axis, type=int if axis in ("round", "previous") else str)
+    values: dict[str, Any] = vars(parser.parse_args())
+    return Cell(**values)
+
+
+def _statistics_path(name: str, axes: tuple[str, ...], cell: Cell) -> Path | None:
+    if not axes or name == "resolve":
+        return None
+    return layout.statistics(name, cell.scene, cell.round if "round" in axes else None, cell.method or None)
+
+
+@contextlib.contextmanager
+def _measured(path: Path | None) -> Iterator[None]:
+    started, wall, cpu = time.time(), time.perf_counter(), time.process_time()
+    yield
+    if path is None:
+        return
+    record: dict[str, Any] = {
+        "started": round(started, 3),
+        "wall_s": round(time.perf_counter() - wall, 3),
+        "cpu_s": round(time.process_time() - cpu, 3),
+        "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "host": {"machine": platform.machine(), "cpus": os.cpu_count(), "torch": "not used"},
+    }
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        record["host"]["torch"] = torch.__version__
+        record["threads"] = torch.get_num_threads()
+        if torch.cuda.is_available():
+            record["host"]["gpu"] = torch.cuda.get_device_name()
+            record["peak_gpu_mb"] = round(torch.cuda.max_memory_allocated() / 2**20, 1)
+    write_json_atomic(path, record)
+
+
+def use_threads(count: int) -> None:
+    """Limit torch to ``count`` threads; 0 keeps its own choice."""
+    if count > 0:
+        import torch
+
+        torch.set_num_threads(count)
+
+
+def remove_folder(path: Path) -> None:
+    """Delete a folder that may not exist."""
+    shutil.rmtree(path, ignore_errors=True)
