@@ -136,13 +136,13 @@ def _near_beam(
     radius = np.sqrt((world.half[blockers] ** 2).sum(-1))
     towards = np.broadcast_to(light_at, middle.shape) if sun else light_at - middle
     squared = np.einsum("tk,tk->t", towards, towards)[:, None]
-    along = (towards @ centre.T - np.einsum("tk,tk->t", towards, middle)[:, None]) / squared
+    to_centre = towards @ centre.T - np.einsum("tk,tk->t", towards, middle)[:, None]
+    along = to_centre / squared
     along = np.maximum(along, 0) if sun else np.clip(along, 0, 1)
-    distance = np.zeros_like(along)
-    for k in range(3):
-        gap = centre[:, k] - middle[:, k, None] - along * towards[:, k, None]
-        distance += gap * gap
-    return distance < (radius + reach[:, None]) ** 2
+    # |c - m - along t|^2 with everything quadratic as matrix products; the margin covers single-precision cancellation.
+    distance = np.einsum("tk,tk->t", middle, middle)[:, None] - 2 * (middle @ centre.T) + (centre**2).sum(-1)
+    distance += along * (along * squared - 2 * to_centre)
+    return distance < (radius + reach[:, None]) ** 2 + 1e-2
 
 
 def _shadow(
@@ -208,21 +208,58 @@ def direct_light(world: World, surface: Surface, samples: int, rng: np.random.Ge
 
 
 def _open_fraction(world: World, surface: Surface, samples: int, reach: float, rng: np.random.Generator) -> Array:
-    """Share of cosine-distributed rays that leave the surface without meeting anything within ``reach`` metres."""
+    """(H,W) mean over cosine-distributed rays of min(distance / reach, 1), smoothed within surfaces."""
     hit = np.isfinite(surface.depth)
-    points = np.stack([p[hit] for p in surface.points], -1)
-    normals = np.stack([n[hit] for n in surface.normals], -1)
-    open_share = np.zeros(len(points), dtype=np.float32)
+    height, width = hit.shape
+    normals = [_tiles(n) for n in surface.normals]
+    points = [_tiles(surface.points[k]) + np.float32(2e-3) * normals[k] for k in range(3)]
+    active = _tiles(hit)
+    low = np.stack([np.where(active, p, np.inf).min(1) for p in points], -1)
+    high = np.stack([np.where(active, p, -np.inf).max(1) for p in points], -1)
+    used = np.flatnonzero(active.any(1))
+    middle = (low[used] + high[used]) / 2
+    spread = np.linalg.norm(high[used] - low[used], axis=-1) / 2 + reach
+    directions, nearest = [], []
     for _ in range(samples):
-        bounce = rng.normal(size=points.shape).astype(np.float32)
-        bounce /= np.linalg.norm(bounce, axis=-1, keepdims=True)
-        direction = normals + np.float32(0.999) * bounce
-        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-        distance = trace_rays(world, points + np.float32(2e-3) * normals, direction)
-        open_share += np.minimum(distance / np.float32(reach), 1) / samples
-    result = np.ones(hit.shape, dtype=np.float32)
-    result[hit] = open_share
-    return result
+        bounce = [rng.standard_normal(points[0].shape, dtype=np.float32) for _ in range(3)]
+        length = np.sqrt(bounce[0] ** 2 + bounce[1] ** 2 + bounce[2] ** 2)
+        directions.append([normals[k] + np.float32(0.999) * bounce[k] / length + _TINY for k in range(3)])
+        nearest.append(np.full(points[0].shape, np.inf, dtype=np.float32))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for index in range(len(world.shape)):
+            turn, centre, half = world.rotation[index], world.centre[index], world.half[index]
+            # Distance from the oriented box, which for walls and floors is much tighter than from a bounding sphere.
+            outside = np.maximum(np.abs((middle - centre) @ turn) - half, 0)
+            rows = used[(outside * outside).sum(-1) < spread * spread]
+            if not len(rows):
+                continue
+            p = [points[k][rows] - centre[k] for k in range(3)]
+            o = [p[0] * turn[0, k] + p[1] * turn[1, k] + p[2] * turn[2, k] for k in range(3)]
+            for direction, best in zip(directions, nearest, strict=True):
+                w = [direction[k][rows] for k in range(3)]
+                d = [w[0] * turn[0, k] + w[1] * turn[1, k] + w[2] * turn[2, k] for k in range(3)]
+                t = first_hit(int(world.shape[index]), half, float(world.extra[index]), o, d)
+                best[rows] = np.minimum(best[rows], t)
+    share = np.zeros(points[0].shape, dtype=np.float32)
+    for direction, best in zip(directions, nearest, strict=True):
+        length = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+        share += np.minimum(best * length / np.float32(reach), 1) / samples
+    return _smooth_within_surfaces(_untile(share, height, width), surface, 3)
+
+
+def _smooth_within_surfaces(values: Array, surface: Surface, radius: int) -> Array:
+    """Mean over the (2 radius + 1)^2 neighbours of the same primitive with a similar normal."""
+    total, count = np.zeros_like(values), np.zeros_like(values)
+    height, width = values.shape
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            here = (slice(max(dy, 0), height + min(dy, 0)), slice(max(dx, 0), width + min(dx, 0)))
+            there = (slice(max(-dy, 0), height + min(-dy, 0)), slice(max(-dx, 0), width + min(-dx, 0)))
+            cosine = sum(n[here] * n[there] for n in surface.normals)
+            weight = (surface.primitive[here] == surface.primitive[there]) & (cosine > 0.9)
+            total[here] += weight * values[there]
+            count[here] += weight
+    return np.where(count > 0, total / np.maximum(count, 1), values)
 
 
 def render_world(
@@ -247,7 +284,7 @@ def render_world(
         height, width: image size.
         supersample: colour samples per pixel side (rounded so that tiles fit).
         light_samples: shadow samples per light and colour sample, for lights with a radius.
-        ambient_samples: ambient-occlusion rays per colour sample; 0 uses a closed form for room corners only.
+        ambient_samples: ambient-occlusion rays per pixel; 0 uses a closed form for room corners only.
         ambient_reach: distance (metres) up to which things occlude the ambient light.
         seed: of the light and occlusion samples.
     """
@@ -267,7 +304,13 @@ def render_world(
         light = direct_light(world, surface, light_samples, rng)
         open_share = None
         if ambient_samples:
-            open_share = _open_fraction(world, surface, ambient_samples, ambient_reach, rng)
+            # Occlusion is smooth: one evaluation per pixel is enough, also when colour is sampled more finely.
+            even_h, even_w = (max(TILE, round(side / TILE) * TILE) for side in (height, width))
+            even_k = np.diag([even_w / width, even_h / height, 1.0]) @ intrinsics
+            even_depth, even_ids = trace_camera(world, pose, even_k, even_h, even_w)
+            even = surface_at(world, pose, *_ray_grid(even_k, even_h, even_w), even_depth, even_ids)
+            open_share = _open_fraction(world, even, ambient_samples, ambient_reach, rng)
+            open_share = np.asarray(cv2.resize(open_share, (fine_w, fine_h), interpolation=cv2.INTER_LINEAR))
         radiance = shade(world, surface, light, open_share, float(fine_k[0, 0]))
         # Clip before filtering: one very bright sample must not swallow a pixel.
         radiance = cv2.resize(np.minimum(radiance, 4), (width, height), interpolation=cv2.INTER_AREA)

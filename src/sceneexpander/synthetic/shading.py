@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneexpander.synthetic.intersect import Array, Shape
-from sceneexpander.synthetic.textures import LEVEL_START, LEVELS, SIZE
+from sceneexpander.synthetic.textures import LEVEL_START, LEVELS, SIZE, TextureKey, packed_texture
 from sceneexpander.synthetic.world import World
 
 
@@ -199,6 +199,22 @@ def sample_texture(
     return result * np.float32(1 / 255)
 
 
+_DETAIL = TextureKey("concrete", 0)
+#: Repeats of the detail texture per repeat of the surface's own: fine grain, and stains that hide the repetition.
+_DETAIL_RATES = (5.3, 0.23)
+
+
+def _detail(strength: Array, u: Array, v: Array, texels: Array) -> Array:
+    """Factor on the albedo, mean about 1: grain and stains at scales the surface's own texture does not have."""
+    planes = np.ascontiguousarray(packed_texture(_DETAIL).T)
+    start = np.zeros(len(u), dtype=np.int64)
+    factor = np.ones(len(u), dtype=np.float32)
+    for rate in _DETAIL_RATES:
+        weights = sample_texture(planes, start, u * np.float32(rate), v * np.float32(rate), texels * np.float32(rate))
+        factor *= 1 + strength * (weights[0] / np.float32(0.78) - 1)
+    return factor
+
+
 def _sky_radiance(world: World, direction: list[Array]) -> Array:
     """(N,3) background; grey where a closed world has a gap."""
     length = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
@@ -249,6 +265,8 @@ def shade(world: World, surface: Surface, light: list[Array], open_share: Array 
     footprint = at_hits(surface.depth) / np.float32(focal_px) / np.sqrt(np.maximum(cosine, np.float32(0.02)))
     texels = footprint * np.maximum(rate_u, rate_v) * np.float32(SIZE)
     weights = sample_texture(world.texels, world.texture_start[material], u, v, texels)
+    if world.detail.any():
+        weights = weights * _detail(world.detail[material], u, v, texels)
     up = (normal[2] + 1) * np.float32(0.5)
     if open_share is None:
         visible = 1 - np.float32(0.3) * np.exp(at_hits(surface.edge) * np.float32(-1 / 0.35))

@@ -7,7 +7,7 @@ one texture serves many colours. A `World` is a set of flat arrays, ready for ve
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ class Material:
         emission: radiance added, as a multiple of the albedo (windows, lamps).
         offset: texture offset in repeats.
         turned: swap u and v (planks and stripes along the other axis).
+        detail: strength of added fine grain and large stains, which hide the repeat of the texture.
     """
 
     texture: TextureKey
@@ -37,6 +38,7 @@ class Material:
     emission: float = 0.0
     offset: tuple[float, float] = (0.0, 0.0)
     turned: bool = False
+    detail: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +83,7 @@ class World:
         texels: (3,texel) uint8 planes, all packed mip pyramids one after the other.
         texture_start: (M,) first texel of each material's pyramid.
         colour_matrix: (M,3,3) linear albedo from texture weights.
-        repeats_per_m, emission, offset, turned: per material.
+        repeats_per_m, emission, offset, turned, detail: per material.
         lights: light sources. ambient: (2,3) linear irradiance from below and from above.
         sky: background; None where the world is closed.
         sky_texels: packed pyramid of the cloud texture.
@@ -106,6 +108,7 @@ class World:
     emission: NDArray[np.float32]
     offset: NDArray[np.float32]
     turned: NDArray[np.bool_]
+    detail: NDArray[np.float32]
     lights: tuple[Light, ...]
     ambient: NDArray[np.float32]
     sky: Sky | None
@@ -128,6 +131,24 @@ class World:
                 distance = np.maximum(distance, self.extra[index] - from_axis)
             best = np.minimum(best, distance)
         return best
+
+
+def merged(world: World, other: World) -> World:
+    """``world`` with the primitives and materials of ``other`` added; lights, sky and bounds are those of ``world``."""
+    joined: dict[str, object] = {}
+    for name in ("shape", "centre", "rotation", "half", "extra", "casts_shadow"):
+        joined[name] = np.concatenate([getattr(world, name), getattr(other, name)])
+    for name in ("colour_matrix", "repeats_per_m", "emission", "offset", "turned", "detail"):
+        joined[name] = np.concatenate([getattr(world, name), getattr(other, name)])
+    return replace(
+        world,
+        face_material=np.concatenate([world.face_material, other.face_material + len(world.texture_start)]),
+        object_id=np.concatenate([world.object_id, other.object_id + len(world.object_names)]),
+        object_names=world.object_names + other.object_names,
+        texels=np.concatenate([world.texels, other.texels], axis=1),
+        texture_start=np.concatenate([world.texture_start, other.texture_start + world.texels.shape[1]]),
+        **joined,  # type: ignore[arg-type]
+    )
 
 
 def rotation_z(angle_rad: float) -> NDArray[np.float64]:
@@ -210,6 +231,7 @@ class WorldBuilder:
             emission=np.array([material.emission for material in materials], dtype=np.float32),
             offset=np.array([material.offset for material in materials], dtype=np.float32),
             turned=np.array([material.turned for material in materials], dtype=np.bool_),
+            detail=np.array([material.detail for material in materials], dtype=np.float32),
             lights=tuple(self.lights),
             ambient=np.array(self.ambient, dtype=np.float32),
             sky=self.sky,
