@@ -22,6 +22,17 @@ def initialise_layers(module: nn.Module, *, generator: torch.Generator) -> None:
             nn.init.zeros_(part.bias)
 
 
+def materialise(module: nn.Module, *, device: torch.device) -> None:
+    """Give every parameter of a module built on the meta device memory of its own, not yet initialised.
+
+    Same as ``Module.to_empty`` for modules without buffers, but without importing the symbolic-shape machinery (seconds).
+    """
+    for part in module.modules():
+        for name, parameter in list(part.named_parameters(recurse=False)):
+            empty = torch.empty(tuple(parameter.shape), dtype=parameter.dtype, device=device)
+            part.register_parameter(name, nn.Parameter(empty, requires_grad=parameter.requires_grad))
+
+
 def normal_(parameter: Tensor, std: float, *, generator: torch.Generator) -> None:
     """Fill with N(0, std^2)."""
     nn.init.normal_(parameter, std=std, generator=generator)

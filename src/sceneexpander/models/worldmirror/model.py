@@ -14,6 +14,7 @@ from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.layers.activations import confidence, positive_exp, signed_expm1, unit_vector
 from sceneexpander.models.layers.camera_head import CameraHead
 from sceneexpander.models.layers.dpt import DptHead
+from sceneexpander.models.layers.init import materialise
 from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction
 from sceneexpander.models.worldmirror.config import WorldMirrorConfig
 from sceneexpander.models.worldmirror.gaussians import (
@@ -106,7 +107,7 @@ class WorldMirror(nn.Module):
         """A freshly initialised model whose numbers come from ``generator`` alone (worldmirror spec 12.3)."""
         with torch.device("meta"):
             model = cls(config, checkpoint_activations=checkpoint_activations)
-        model.to_empty(device=generator.device)
+        materialise(model, device=generator.device)
         initialise(model, generator=generator)
         return model
 

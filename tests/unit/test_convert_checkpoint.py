@@ -1,0 +1,198 @@
+"""The checkpoint converter reads plain tensors and never runs anything."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from sceneexpander.convert_checkpoint import ALLOWED, convert, main, read_checkpoint
+from sceneexpander.errors import UserError
+
+
+def write_archive(path: Path, data: bytes, storages: dict[str, bytes] | None = None, compressed: bool = False) -> Path:
+    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("archive/data.pkl", data)
+        for key, raw in (storages or {}).items():
+            archive.writestr(f"archive/data/{key}", raw)
+    return path
+
+
+def forged(offset: int, size: tuple[int, ...], stride: tuple[int, ...]) -> bytes:
+    """A pickle of one tensor with any geometry over a storage of 4 floats."""
+
+    marker = object()
+
+    class Forger(pickle.Pickler):
+        def persistent_id(self, obj: Any) -> Any:
+            return ("storage", torch.FloatStorage, "0", "cpu", 4) if obj is marker else None
+
+    class Tensorlike:
+        def __reduce__(self) -> Any:
+            return torch._utils._rebuild_tensor_v2, (marker, offset, size, stride, False, OrderedDict())
+
+    buffer = io.BytesIO()
+    Forger(buffer, protocol=2).dump({"x": Tensorlike()})
+    return buffer.getvalue()
+
+
+def test_state_dicts_come_through_unchanged(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    base = torch.randn(4, 6, generator=generator)
+    tensors = {
+        "plain": base,
+        "transposed": base.t(),
+        "sliced": base[1:, ::2],
+        "half": base.half(),
+        "bfloat": base.bfloat16(),
+        "count": torch.tensor(7),
+        "flags": torch.tensor([True, False]),
+        "empty": torch.empty(0, 3),
+        "parameter": torch.nn.Parameter(base[0].clone()),
+    }
+    torch.save(tensors, tmp_path / "in.pt")
+    assert convert(tmp_path / "in.pt", tmp_path / "out.safetensors") == len(tensors)
+    loaded = load_file(tmp_path / "out.safetensors")
+    assert loaded.keys() == tensors.keys()
+    for name, value in tensors.items():
+        assert loaded[name].dtype == value.dtype
+        assert torch.equal(loaded[name], value.detach())
+
+
+def test_weights_are_found_inside_a_training_checkpoint(tmp_path: Path) -> None:
+    module = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.BatchNorm1d(3))
+    torch.save({"epoch": 3, "state_dict": module.state_dict(), "ema": {"w": torch.ones(1)}}, tmp_path / "in.ckpt")
+    assert read_checkpoint(tmp_path / "in.ckpt").keys() == module.state_dict().keys()
+    assert read_checkpoint(tmp_path / "in.ckpt", key="ema").keys() == {"w"}
+    with pytest.raises(UserError, match="its entries: epoch, state_dict, ema"):
+        read_checkpoint(tmp_path / "in.ckpt", key="nothing")
+
+
+class Malicious:
+    """Creates a folder when it is unpickled carelessly."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.target),)
+
+
+def test_a_malicious_pickle_never_fires(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = tmp_path / "side-effect"
+    data = pickle.dumps({"w": Malicious(target)}, protocol=2)
+    # The fixture is real: a careless reader would have run it.
+    pickle.loads(data)  # noqa: S301
+    assert target.exists()
+    target.rmdir()
+    path = write_archive(tmp_path / "evil.pt", data)
+    with pytest.raises(UserError, match=r"asks for (posix|nt|os)\.mkdir, which is not allowed"):
+        read_checkpoint(path)
+    with pytest.raises(SystemExit) as stop:
+        main([str(path), str(tmp_path / "out.safetensors")])
+    assert stop.value.code == 2
+    assert "mkdir" in capsys.readouterr().err
+    assert not target.exists()
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [
+        ("builtins", "eval"),
+        ("builtins", "getattr"),
+        ("torch", "load"),
+        ("torch", "Tensor"),
+        ("torch._utils", "_rebuild_qtensor"),
+        ("torch.nn.modules.linear", "Linear"),
+        ("collections", "OrderedDict.__class__"),
+        ("argparse", "Namespace"),
+        ("numpy._core.multiarray", "scalar"),
+    ],
+)
+def test_names_off_the_list_are_refused_by_name(tmp_path: Path, module: str, name: str) -> None:
+    path = write_archive(tmp_path / "in.pt", f"c{module}\n{name}\n.".encode())
+    with pytest.raises(UserError) as error:
+        read_checkpoint(path)
+    assert f"{module}.{name}, which is not allowed" in error.value.line()
+
+
+@pytest.mark.parametrize(
+    "name", ["torch._utils\n_rebuild_tensor_v2", "torch\nFloatStorage", "collections\nOrderedDict"]
+)
+def test_allowed_objects_cannot_be_changed_by_a_pickle(tmp_path: Path, name: str) -> None:
+    # BUILD with a (None, attributes) state would set attributes on the object before it.
+    path = write_archive(tmp_path / "in.pt", f"c{name}\n(NdVhacked\nI1\ns".encode() + b"tb.")
+    with pytest.raises(UserError):
+        read_checkpoint(path)
+    assert not any(hasattr(entry, "hacked") for entry in ALLOWED.values())
+
+
+@pytest.mark.parametrize(
+    ("offset", "size", "stride"),
+    [(0, (5,), (1,)), (3, (2,), (1,)), (0, (2, 2), (1, 3)), (0, (1 << 40,), (0,)), (-1, (1,), (1,)), (0, (2,), (-1,))],
+)
+def test_tensors_that_leave_their_storage_are_refused(
+    tmp_path: Path, offset: int, size: tuple[int, ...], stride: tuple[int, ...]
+) -> None:
+    path = write_archive(tmp_path / "in.pt", forged(offset, size, stride), {"0": b"\0" * 16})
+    with pytest.raises(UserError, match="a tensor"):
+        read_checkpoint(path)
+
+
+def test_the_forged_pickle_is_good_when_its_geometry_is(tmp_path: Path) -> None:
+    path = write_archive(tmp_path / "in.pt", forged(1, (3,), (1,)), {"0": b"\0" * 16})
+    assert read_checkpoint(path)["x"].shape == (3,)
+
+
+def test_storages_of_the_wrong_size_or_compressed_are_refused(tmp_path: Path) -> None:
+    good = forged(0, (4,), (1,))
+    with pytest.raises(UserError, match="has 12 bytes, expected 16"):
+        read_checkpoint(write_archive(tmp_path / "a.pt", good, {"0": b"\0" * 12}))
+    with pytest.raises(UserError, match="uncompressed"):
+        read_checkpoint(write_archive(tmp_path / "b.pt", good, {"0": b"\0" * 16}, compressed=True))
+    with pytest.raises(UserError, match="storage '0' is missing"):
+        read_checkpoint(write_archive(tmp_path / "c.pt", good))
+
+
+@pytest.mark.parametrize("cut", [10, 200])
+def test_damaged_files_are_one_clear_line(tmp_path: Path, cut: int) -> None:
+    torch.save({"w": torch.ones(100)}, tmp_path / "in.pt")
+    data = (tmp_path / "in.pt").read_bytes()
+    (tmp_path / "in.pt").write_bytes(data[:-cut])
+    with pytest.raises(UserError) as error:
+        read_checkpoint(tmp_path / "in.pt")
+    assert "\n" not in error.value.line()
+
+
+@pytest.mark.parametrize("data", [b"", b".", b"garbage", b"}q\x00.", b"I1\n.", b"(lp0\n.", b"]" * 50 + b"."])
+def test_odd_pickles_are_one_clear_line(tmp_path: Path, data: bytes) -> None:
+    with pytest.raises(UserError):
+        read_checkpoint(write_archive(tmp_path / "in.pt", data))
+
+
+def test_old_formats_and_wrong_targets_are_refused(tmp_path: Path) -> None:
+    torch.save({"w": torch.ones(1)}, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    with pytest.raises(UserError, match="is not a zip-format"):
+        read_checkpoint(tmp_path / "old.pt")
+    with pytest.raises(UserError, match="does not exist"):
+        read_checkpoint(tmp_path / "none.pt")
+    torch.save({"w": torch.ones(1)}, tmp_path / "in.pt")
+    with pytest.raises(UserError, match=r"must end in \.safetensors"):
+        convert(tmp_path / "in.pt", tmp_path / "out.pt")
+
+
+def test_the_command_reports_what_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torch.save({"w": torch.ones(2)}, tmp_path / "in.pt")
+    assert main([str(tmp_path / "in.pt"), str(tmp_path / "sub" / "out.safetensors")]) == 0
+    assert "1 tensors" in capsys.readouterr().out
+    assert [p.name for p in (tmp_path / "sub").iterdir()] == ["out.safetensors"]
