@@ -46,14 +46,15 @@ def evaluate(
         views: pictures of at least the reconstruction's views.
         config: settings.
         scene: name for the row.
-        round_number: the round; the ``inserted_`` numbers are those of the view inserted in it (the last generated one).
+        round_number: the round; the ``inserted_`` numbers are those of the view inserted in it, if the reconstruction has it.
         seed: for the row.
         navigation: frames for the coverage, if wanted.
         truth: known truth, if any.
     """
     captured = preservation(reconstruction, views, config)
     inserted = insertion_fidelity(reconstruction, views, config)
-    last = inserted[-1] if inserted else None
+    in_this_round = {record.view_id for record in views.records if record.round == round_number}
+    new = next((row for row in inserted if row.view_id in in_this_round), None)
     frames = None
     if navigation is not None:
         frames = navigation_coverage(
@@ -80,13 +81,13 @@ def evaluate(
         coverage=_mean(row.coverage for row in captured),
         depth_disagreement=_mean_of_all(captured, "depth_disagreement"),
         others_psnr_db=_mean_of_all(captured, "others_psnr_db"),
-        inserted_psnr_db=None if last is None else last.psnr_db,
-        inserted_ssim=None if last is None else last.ssim,
-        inserted_generated_share=None if last is None else last.generated_share,
-        inserted_others_psnr_db=None if last is None else last.others_psnr_db,
+        inserted_psnr_db=None if new is None else new.psnr_db,
+        inserted_ssim=None if new is None else new.ssim,
+        inserted_generated_share=None if new is None else new.generated_share,
+        inserted_others_psnr_db=None if new is None else new.others_psnr_db,
         navigation_coverage=None if frames is None else float(frames.double().mean()),
         navigation_frames=0 if frames is None else len(frames),
-        truth=None if truth is None else against_truth(reconstruction, views, truth),
+        truth=None if truth is None else against_truth(reconstruction, views, truth, round_number=round_number),
         views=(*captured, *inserted),
         versions=_versions(),
     )

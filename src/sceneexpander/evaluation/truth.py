@@ -118,13 +118,16 @@ class _Known:
     """A view of the reconstruction with its truth, brought to stored pixels."""
 
     index: int
+    record: ViewRecord
     truth: ViewTruth
     depth: Float[Tensor, "height width"] | None
     new_region: Bool[Tensor, "height width"] | None
 
 
-def against_truth(reconstruction: Reconstruction, views: ViewSet, truth: SceneTruth) -> TruthMetrics:
-    """Errors of cameras and depths; None where too little is known (see `TruthMetrics`)."""
+def against_truth(
+    reconstruction: Reconstruction, views: ViewSet, truth: SceneTruth, *, round_number: int
+) -> TruthMetrics:
+    """Errors of cameras and depths, and of the view inserted in this round; None where too little is known (see `TruthMetrics`)."""
     records = {record.view_id: record for record in views.records}
     known = []
     for index, view_id in enumerate(reconstruction.view_ids):
@@ -135,13 +138,14 @@ def against_truth(reconstruction: Reconstruction, views: ViewSet, truth: SceneTr
             known.append(
                 _Known(
                     index=index,
+                    record=record,
                     truth=found,
                     depth=_in_stored_pixels(found.depth, record, height, width),
                     new_region=_in_stored_pixels(found.new_region, record, height, width),
                 )
             )
-    captured = [item for item in known if not bool(reconstruction.generated[item.index])]
-    inserted = [item for item in known if bool(reconstruction.generated[item.index])][-1:]
+    captured = [item for item in known if not item.record.generated]
+    inserted = [item for item in known if item.record.generated and item.record.round == round_number]
     rotation, direction = _pair_errors(reconstruction, _pairs(captured, captured))
     inserted_rotation, inserted_direction = _pair_errors(reconstruction, _pairs(captured, inserted))
     scale = _depth_scale(reconstruction, captured)

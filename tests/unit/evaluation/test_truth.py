@@ -12,8 +12,10 @@ import pytest
 import torch
 from PIL import Image
 
+from sceneexpander.artifacts.metrics import TruthMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError, sha256_of_file
+from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation import SceneTruth, ViewTruth, against_truth, load_truth
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
@@ -28,6 +30,10 @@ def made(eyes: tuple[float, ...] = EYES) -> Reconstruction:
     if len(eyes) > 3:
         poses[1, 1, 3] = 0.3  # off the line
     return dataclasses.replace(scene, world_from_cam=poses)
+
+
+def errors(scene: Reconstruction, views: ViewSet, truth: SceneTruth) -> TruthMetrics:
+    return against_truth(scene, views, truth, round_number=1)
 
 
 def truth_of(scene: Reconstruction) -> SceneTruth:
@@ -50,7 +56,7 @@ def truth_of(scene: Reconstruction) -> SceneTruth:
 
 def test_truth_itself_has_no_error() -> None:
     scene = made()
-    found = against_truth(scene, own_pictures(scene), truth_of(scene))
+    found = errors(scene, own_pictures(scene), truth_of(scene))
     for name, value in dataclasses.asdict(found).items():
         expected = 1.0 if name.endswith("within_125") else 0.0
         assert value == pytest.approx(expected, abs=1e-5), name
@@ -61,7 +67,7 @@ def test_frame_and_scale_do_not_count() -> None:
     rotation = rotation_from_quat_wxyz(torch.tensor([0.8, -0.2, 0.4, 0.1]))
     moved = Similarity(scale=3.0, rotation=rotation, translation=torch.tensor([1.0, 2.0, -1.0]))
     other = dataclasses.replace(scene, world_from_cam=moved.poses(scene.world_from_cam), depth=scene.depth * 3)
-    found = against_truth(other, own_pictures(scene), truth_of(scene))
+    found = errors(other, own_pictures(scene), truth_of(scene))
     assert found.camera_rotation_deg == pytest.approx(0, abs=1e-4)
     # float32 poses: an angle of 1e-7 rad between directions is what rounding alone gives.
     assert found.camera_direction_deg == pytest.approx(0, abs=1e-3)
@@ -77,7 +83,7 @@ def test_a_turned_inserted_camera() -> None:
     turn[:3, :3] = rotation_from_quat_wxyz(torch.tensor([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0]))
     poses = scene.world_from_cam.clone()
     poses[-1] = poses[-1] @ turn
-    found = against_truth(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
+    found = errors(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
     assert found.inserted_rotation_deg == pytest.approx(5, abs=1e-3)
     assert found.inserted_direction_deg == pytest.approx(0, abs=1e-3)
     assert found.camera_rotation_deg == pytest.approx(0, abs=1e-4)
@@ -88,19 +94,27 @@ def test_a_moved_camera() -> None:
     poses = scene.world_from_cam.clone()
     poses[1, :3, 3] = torch.tensor([1.0, 1.0, 0.0])
     scene = dataclasses.replace(scene, generated=torch.zeros(2, dtype=torch.bool))
-    found = against_truth(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
+    found = errors(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
     assert found.camera_direction_deg == pytest.approx(45, abs=1e-4)
     assert found.camera_ate is None  # two cameras always fit
     poses[1, :3, 3] = 0
-    found = against_truth(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
+    found = errors(dataclasses.replace(scene, world_from_cam=poses), own_pictures(scene), truth_of(scene))
     assert found.camera_direction_deg == 90
+
+
+def test_only_the_view_of_this_round_counts_as_inserted() -> None:
+    scene = made()
+    found = against_truth(scene, own_pictures(scene), truth_of(scene), round_number=2)
+    assert found.inserted_rotation_deg is None
+    assert found.new_region_abs_rel is None
+    assert found.depth_abs_rel is not None
 
 
 def test_depth_errors_of_known_size() -> None:
     scene = made()
     depth = scene.depth.clone()
     depth[-1, :, WIDTH // 2 :] *= 1.5
-    found = against_truth(dataclasses.replace(scene, depth=depth), own_pictures(scene), truth_of(scene))
+    found = errors(dataclasses.replace(scene, depth=depth), own_pictures(scene), truth_of(scene))
     assert found.depth_abs_rel == pytest.approx(0, abs=1e-6)
     assert found.new_region_abs_rel == pytest.approx(0.5, abs=1e-5)
     assert found.new_region_within_125 == 0
@@ -115,11 +129,11 @@ def test_unknown_pixels_and_views_are_left_out() -> None:
     del views["hash3"]
     wrong = scene.depth.clone()
     wrong[0, :20] = 50.0  # where nothing is known
-    found = against_truth(dataclasses.replace(scene, depth=wrong), own_pictures(scene), SceneTruth(views=views))
+    found = errors(dataclasses.replace(scene, depth=wrong), own_pictures(scene), SceneTruth(views=views))
     assert found.depth_abs_rel == pytest.approx(0, abs=1e-6)
     assert found.inserted_rotation_deg is None
     assert found.new_region_abs_rel is None
-    nothing = against_truth(scene, own_pictures(scene), SceneTruth())
+    nothing = errors(scene, own_pictures(scene), SceneTruth())
     assert set(dataclasses.asdict(nothing).values()) == {None}
 
 
@@ -141,11 +155,11 @@ def test_truth_is_brought_to_stored_pixels() -> None:
     original[:, :4] = 99.0
     truth = truth_of(scene)
     large = {key: dataclasses.replace(value, depth=original, new_region=None) for key, value in truth.views.items()}
-    found = against_truth(scene, dataclasses.replace(views, records=records), SceneTruth(views=large))
+    found = errors(scene, dataclasses.replace(views, records=records), SceneTruth(views=large))
     assert found.depth_abs_rel == pytest.approx(0, abs=1e-6)
     assert found.depth_within_125 == 1
     with pytest.raises(ArtifactError, match="truth of 56 x 88 pixels"):
-        against_truth(scene, views, SceneTruth(views=large))
+        errors(scene, views, SceneTruth(views=large))
 
 
 def test_truth_folder(tmp_path: Path) -> None:

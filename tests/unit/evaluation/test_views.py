@@ -142,6 +142,13 @@ def test_captured_only_row() -> None:
     assert row.navigation_coverage is None
 
 
+def test_only_the_view_of_this_round_counts_as_inserted() -> None:
+    scene = made_reconstruction()
+    row = evaluate(scene, own_pictures(scene), CONFIG, scene="m", round_number=2, seed=0)
+    assert row.generated_views == 1
+    assert row.inserted_psnr_db is None
+
+
 def test_non_finite_numbers_are_refused() -> None:
     scene = made_reconstruction()
     row = evaluate(scene, own_pictures(scene), CONFIG, scene="m", round_number=1, seed=0)
