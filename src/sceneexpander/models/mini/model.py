@@ -1,0 +1,181 @@
+"""`Mini`: the embedded reconstructor. Geometry first, a small network for what geometry cannot see."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from sceneexpander.errors import UserError
+from sceneexpander.geometry.camera import camera_vector_from_pose, pose_from_camera_vector, unproject_to_world
+from sceneexpander.geometry.priors import Priors
+from sceneexpander.models.mini.config import MiniConfig
+from sceneexpander.models.mini.inputs import RequiredPriors, require_priors, working_views
+from sceneexpander.models.mini.network import MiniNetwork
+from sceneexpander.models.mini.normals import face_camera, viewing_rays
+from sceneexpander.models.mini.splats import covered_by_others, pixel_aligned_gaussians
+from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction
+from sceneexpander.models.weights import load_weights, resolve_weights
+
+SIZE_MULTIPLE = 14  # as WorldMirror's, so that either can be given the same images
+_CONFIG_KEY = "mini_config"
+_BASE_CONF_LOGIT = (1.1, 2.0)  # log(conf - 1) of the base: this, plus this where confident
+
+
+class Mini(nn.Module):
+    """Residuals of WorldMirror's building blocks on the cameras and the dense depth of the geometric front-end.
+
+    With zero residuals (a new model) the prediction *is* the front-end's: its depth exactly, its cameras, the normals of
+    its depth. The network works at a fixed internal resolution; residuals are upsampled to the size of the images.
+    Priors (poses, intrinsics, depth, evidence) are required. The world frame is the first view's camera, and stays so.
+    """
+
+    name = "mini"
+    size_multiple = SIZE_MULTIPLE
+    requires_priors = True
+
+    def __init__(self, config: MiniConfig | None = None) -> None:
+        super().__init__()
+        self.config = MiniConfig() if config is None else config
+        self.network = MiniNetwork(self.config)
+
+    def predict(
+        self,
+        images: Float[Tensor, "view 3 height width"],
+        priors: Priors | None = None,
+        *,
+        heads: frozenset[Head] = ALL_HEADS,
+        generated: Bool[Tensor, " view"] | None = None,
+    ) -> Prediction:
+        """Reconstruct S views, see `Reconstructor.predict`.
+
+        Raises:
+            ValueError: H or W is no multiple of ``size_multiple``, or priors are missing or do not fit.
+        """
+        views, _, height, width = images.shape
+        if height % self.size_multiple or width % self.size_multiple:
+            raise ValueError(f"image size {height} x {width} is no multiple of {self.size_multiple}")
+        required = require_priors(images, priors)
+        with torch.no_grad():
+            inputs = working_views(images, required, self.config)
+        features = self.network.features(inputs)
+        camera_vector, world_from_cam, intrinsics = self._cameras(features.camera_tokens, required, height, width)
+
+        wants_depth = bool(heads & {Head.DEPTH, Head.POINTS, Head.GAUSSIANS})
+        wants_normals = bool(heads & {Head.NORMALS, Head.GAUSSIANS})
+        depth = depth_conf = normals = normals_conf = points = None
+        gaussian_depth = gaussians = None
+        if wants_depth:
+            depth, depth_conf = self._depth(self.network.depth_head(features.dense), required)
+        if wants_normals:
+            raw = self.network.normals_head(features.dense)
+            base = inputs.base_normals.movedim(-1, 1)
+            upsampled = _upsample(torch.cat([base + raw[:, :3], raw[:, 3:]], dim=1), height, width)
+            rays = viewing_rays(intrinsics.detach(), height, width)
+            normals = face_camera(upsampled[:, :3].movedim(1, -1), rays)
+            normals_conf = 1 + upsampled[:, 3].clamp(max=10).exp()
+        if depth is not None and Head.POINTS in heads:
+            points = unproject_to_world(depth, intrinsics, world_from_cam)
+        if depth is not None and depth_conf is not None and normals is not None and Head.GAUSSIANS in heads:
+            flags = torch.zeros(views, dtype=torch.bool, device=images.device) if generated is None else generated
+            transparent = covered_by_others(
+                depth, required.confident, world_from_cam, intrinsics, most_views=self.config.cross_views
+            )
+            gaussians, gaussian_depth = pixel_aligned_gaussians(
+                images,
+                depth,
+                depth_conf,
+                normals,
+                world_from_cam,
+                intrinsics,
+                transparent,
+                _upsample(self.network.gaussian_head(features.dense), height, width),
+                flags,
+                self.config,
+            )
+        asked_depth, asked_normals = Head.DEPTH in heads, Head.NORMALS in heads
+        return Prediction(
+            camera_vector=camera_vector,
+            world_from_cam=world_from_cam,
+            intrinsics_px=intrinsics,
+            depth=depth if asked_depth else None,
+            depth_conf=depth_conf if asked_depth else None,
+            normals=normals if asked_normals else None,
+            normals_conf=normals_conf if asked_normals else None,
+            points=points,
+            points_conf=depth_conf if points is not None else None,
+            gaussian_depth=gaussian_depth,
+            gaussians=gaussians,
+        )
+
+    @classmethod
+    def from_weights(cls, weights: str | Path) -> Mini:
+        """The model of a weights file: ``builtin`` (shipped with the package) or a path. Its configuration is in the file.
+
+        Raises:
+            UserError: missing or damaged file, not weights of `Mini`, or tensors that do not fit.
+        """
+        path = resolve_weights(str(weights), model=cls.name).path
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+        try:
+            config = MiniConfig.from_dict(json.loads(metadata[_CONFIG_KEY]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"holds no configuration of mini ({error})", where=path, fix="use weights that this version wrote"
+            ) from None
+        model = cls(config)
+        load_weights(model, path)
+        return model
+
+    def save_weights(self, path: Path) -> None:
+        """Write the weights in half precision with the configuration, atomically."""
+        tensors = {name: value.detach().half().contiguous() for name, value in self.state_dict().items()}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        save_file(tensors, scratch, {_CONFIG_KEY: json.dumps(self.config.to_dict())})
+        with scratch.open("rb") as file:
+            os.fsync(file.fileno())
+        os.replace(scratch, path)
+
+    def _cameras(
+        self, tokens: Float[Tensor, "view dim"], priors: RequiredPriors, height: int, width: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(camera vectors, world_from_cam, intrinsics): the priors, refined by the camera head in normalised scale."""
+        poses = priors.world_from_cam
+        scale = poses.new_ones(9)
+        scale[:3] = priors.scale
+        start = camera_vector_from_pose(poses, priors.intrinsics_px, height, width)
+        vector = self.network.camera_head(tokens[None], (start / scale)[None])[-1][0] * scale
+        # The first view is the world: only its fields of view may change.
+        pose_part = torch.cat([start[:1, :7], vector[1:, :7]])
+        fov = vector[:, 7:].clamp(0.05, 3.0)
+        vector = torch.cat([pose_part, fov], dim=-1)
+        world_from_cam, _ = pose_from_camera_vector(vector, height, width)
+        # The prior's principal point is kept; an unchanged field of view gives its focal length exactly.
+        ratio = torch.tan(start[:, 7:].clamp(0.05, 3.0) / 2) / torch.tan(fov / 2)
+        gain = torch.ones_like(priors.intrinsics_px)
+        gain[:, 0, 0], gain[:, 1, 1] = ratio[:, 1], ratio[:, 0]
+        return vector, world_from_cam, priors.intrinsics_px * gain
+
+    def _depth(
+        self, raw: Float[Tensor, "view 2 out_height out_width"], priors: RequiredPriors
+    ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
+        """(depth, confidence): log depth = log base + (1 - pull x confident) x residual."""
+        limit = self.config.max_log_residual
+        residual, logit = _upsample(raw, *priors.depth.shape[-2:]).unbind(1)
+        free = 1 - self.config.confident_pull * priors.confident
+        depth = priors.depth * (free * limit * torch.tanh(residual / limit)).exp()
+        base_logit = _BASE_CONF_LOGIT[0] + _BASE_CONF_LOGIT[1] * priors.confident
+        return depth, 1 + (base_logit + logit).clamp(max=10).exp()
+
+
+def _upsample(maps: Float[Tensor, "view channel rows columns"], height: int, width: int) -> Tensor:
+    return functional.interpolate(maps, size=(height, width), mode="bilinear", align_corners=False)

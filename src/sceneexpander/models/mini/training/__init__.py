@@ -1,0 +1,1 @@
+"""Training of the embedded reconstructor on procedural scenes with known truth, and its scores. Not needed to use the model."""

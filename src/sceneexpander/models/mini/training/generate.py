@@ -1,0 +1,168 @@
+"""Makes samples: a procedural scene, simulated front-end errors, and the real dense base run on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.frontend.dense import DenseConfig, dense_depth
+from sceneexpander.frontend.simulated import perturb_poses, sample_sparse_points
+from sceneexpander.frontend.sparse_points import SparsePoints
+from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
+from sceneexpander.geometry.rigid import rigid_inverse
+from sceneexpander.models.mini.training.sample import Sample
+from sceneexpander.synthetic.textures import Split
+from sceneexpander.synthetic.views import SyntheticViews, make_views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GeneratorConfig:
+    """What samples are drawn from. Shares and ranges; every draw comes from the sample's own seed."""
+
+    sizes: tuple[tuple[int, int], ...] = ((168, 224), (224, 168), (168, 168), (112, 168))  # height, width
+    view_shares: tuple[float, ...] = (0.03, 0.2, 0.27, 0.33, 0.1, 0.07)  # of 1, 2, ... input views
+    held_out_views: int = 1
+    exact_pose_share: float = 0.35
+    strong_noise_share: float = 0.12
+    wrong_focal_share: float = 0.1
+    pose_noise_deg: tuple[float, float] = (0.02, 0.25)  # log-uniform
+    strong_noise_deg: tuple[float, float] = (0.25, 1.0)
+    baseline_noise_per_deg: float = 0.1  # share of the mean baseline per degree
+    wrong_focal: tuple[float, float] = (0.75, 1.33)  # log-uniform factor
+    points_per_view: tuple[tuple[int, int], ...] = ((15, 50), (50, 150), (50, 150), (150, 400))
+    point_noise: tuple[float, float] = (0.005, 0.03)
+    outliers: float = 0.03
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Conditions:
+    """How good the simulated front-end is for one sample."""
+
+    rotation_deg: float = 0.0
+    baseline_fraction: float = 0.0
+    focal_factor: float = 1.0
+    points_per_view: tuple[int, int] = (50, 50)
+    point_noise: float = 0.03
+    outliers: float = 0.03
+
+
+def training_sample(index: int, seed: int, config: GeneratorConfig, *, split: Split = "train") -> Sample:
+    """Sample number ``index`` of the stream ``seed``: the same arguments give the same sample."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
+    shares = torch.tensor(config.view_shares)
+    for _ in range(20):
+        inputs = 1 + int(torch.multinomial(shares, 1, generator=generator))
+        height, width = config.sizes[int(torch.randint(len(config.sizes), (), generator=generator))]
+        scene_seed = int(torch.randint(2**31 - 1, (), generator=generator))
+        conditions = _draw_conditions(config, generator)
+        try:
+            scene = make_views(
+                scene_seed,
+                views=inputs + config.held_out_views,
+                height=height,
+                width=width,
+                supersample=1.3,
+                split=split,
+            )
+        except ValueError:
+            # Some worlds have no camera set of that size; the next draw is part of the same deterministic stream.
+            continue
+        return sample_of_scene(scene, inputs, conditions, generator)
+    raise ValueError(f"sample {index} of stream {seed}: no scene in 20 attempts")
+
+
+def _draw_conditions(config: GeneratorConfig, generator: torch.Generator) -> Conditions:
+    def log_uniform(low: float, high: float) -> float:
+        return low * (high / low) ** float(torch.rand((), generator=generator))
+
+    kind = float(torch.rand((), generator=generator))
+    exact = kind < config.exact_pose_share
+    strong = not exact and kind < config.exact_pose_share + config.strong_noise_share
+    noise = 0.0 if exact else log_uniform(*(config.strong_noise_deg if strong else config.pose_noise_deg))
+    wrong_focal = float(torch.rand((), generator=generator)) < config.wrong_focal_share
+    focal = log_uniform(*config.wrong_focal) if wrong_focal else 1.0
+    points = config.points_per_view[int(torch.randint(len(config.points_per_view), (), generator=generator))]
+    low, high = config.point_noise
+    return Conditions(
+        rotation_deg=noise,
+        baseline_fraction=noise * config.baseline_noise_per_deg,
+        focal_factor=focal,
+        points_per_view=points,
+        point_noise=low + (high - low) * float(torch.rand((), generator=generator)),
+        outliers=config.outliers,
+    )
+
+
+def sample_of_scene(
+    scene: SyntheticViews,
+    inputs: int,
+    conditions: Conditions,
+    generator: torch.Generator,
+    *,
+    dense: DenseConfig | None = None,
+) -> Sample:
+    """Run the simulated sparse front-end and the real dense base on the first ``inputs`` views; the rest are held out.
+
+    A view that shares nothing with the others becomes the last input without a pose.
+    """
+    order = list(range(len(scene.images)))
+    posed = torch.ones(inputs, dtype=torch.bool)
+    if scene.disconnected is not None and len(order) > 1:
+        order.remove(scene.disconnected)
+        order.insert(inputs - 1, scene.disconnected)
+        posed[inputs - 1] = inputs == 1
+    pick = torch.tensor(order)
+    images, depth, valid = scene.images[pick], scene.depth[pick], scene.valid[pick]
+    intrinsics = scene.intrinsics_px[pick]
+    truth = scene.world_from_cam[pick]
+    truth = rigid_inverse(truth[:1]) @ truth
+    kept = slice(0, inputs)
+    sparse = sample_sparse_points(
+        images[kept][posed],
+        depth[kept][posed],
+        valid[kept][posed],
+        truth[kept][posed],
+        intrinsics[kept][posed],
+        generator,
+        per_view=conditions.points_per_view,
+        depth_noise=conditions.point_noise,
+        outliers=conditions.outliers,
+    )
+    prior_poses = perturb_poses(truth[kept].clone(), conditions.rotation_deg, conditions.baseline_fraction, generator)
+    prior_poses[~posed] = torch.eye(4)
+    prior_intrinsics = intrinsics[kept].clone()
+    prior_intrinsics[:, [0, 1], [0, 1]] *= conditions.focal_factor
+    # A longer focal length explains the first view equally well with everything proportionally farther away.
+    prior_poses[:, 2, 3] *= conditions.focal_factor
+    points = sparse.points_world * sparse.points_world.new_tensor([1.0, 1.0, conditions.focal_factor])
+    sparse = SparsePoints(
+        points_world=points, view_index=sparse.view_index, point_index=sparse.point_index, pixel_xy=sparse.pixel_xy
+    )
+    settings = DenseConfig(threads=1) if dense is None else dense
+    base = dense_depth(images[kept], prior_poses, prior_intrinsics, sparse, settings, posed=posed)
+    log_base = base.depth.log()
+    gap = base.evidence[:, EVIDENCE_CHANNELS.index("sparse")]
+    return Sample(
+        images=images,
+        log_depth=torch.where(valid, depth.log(), torch.inf) + torch.tensor(conditions.focal_factor).log(),
+        normals=scene.normals[pick],
+        world_from_cam=truth,
+        intrinsics_px=intrinsics,
+        prior_world_from_cam=prior_poses,
+        prior_intrinsics_px=prior_intrinsics,
+        prior_log_depth=log_base,
+        sparse_log_depth=_add_gap(log_base, gap),
+        evidence=base.evidence,
+        posed=posed,
+        wrong_focal=conditions.focal_factor != 1.0,
+        kind=scene.kind,
+        seed=scene.seed,
+    )
+
+
+def _add_gap(log_base: Float[Tensor, "view height width"], gap: Float[Tensor, "view height width"]) -> Tensor:
+    """The sparse interpolation, from the evidence channel log(interpolated / final), which is clamped to [-1, 1]."""
+    return log_base + gap
