@@ -43,6 +43,14 @@ def cpu_seconds(function: Callable[[], object], runs: int) -> float:
     return statistics.median(times)
 
 
+def report(name: str, function: Callable[[], object], runs: int) -> None:
+    """Time one thing and print its line at once: on a busy machine the whole takes minutes."""
+    seconds = cpu_seconds(function, runs)
+    recorded = RECORDED.get(name)
+    against = "" if recorded is None else f"   recorded {recorded:6.2f} s   ratio {seconds / recorded:.2f}"
+    print(f"{name:26s} {seconds:6.2f} s{against}", flush=True)
+
+
 def main() -> None:
     """Time and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -75,24 +83,19 @@ def main() -> None:
         splats = (merged.means, merged.quat_wxyz, merged.scales, merged.opacities, merged.sh, out.cameras.vector)
         torch.stack([value.mean() for value in (*maps, *splats)]).sum().backward()
 
-    with torch.inference_mode():
-        measured = {
-            "trunk forward": cpu_seconds(lambda: model.encode(images), options.runs),
-            "full forward": cpu_seconds(lambda: model(images), options.runs),
-        }
-        geometry = cpu_seconds(lambda: model(images, heads=GEOMETRY_HEADS), options.runs)
-    if options.backward:
-        measured["trunk forward + backward"] = cpu_seconds(lambda: backward(False), options.runs)
-        measured["full forward + backward"] = cpu_seconds(lambda: backward(True), options.runs)
     print(
         f"torch {torch.__version__}, 1 thread, float32, {count:,} parameters, {VIEWS} views {HEIGHT}x{WIDTH}; CPU seconds"
     )
     print(
         "'recorded' is the reference implementation in another run on another machine: an indication, not a comparison"
     )
-    for name, seconds in measured.items():
-        print(f"{name:26s} {seconds:6.2f} s   recorded {RECORDED[name]:6.2f} s   ratio {seconds / RECORDED[name]:.2f}")
-    print(f"{'cameras, depth, normals':26s} {geometry:6.2f} s   (what adaptation runs)")
+    with torch.inference_mode():
+        report("trunk forward", lambda: model.encode(images), options.runs)
+        report("full forward", lambda: model(images), options.runs)
+        report("cameras, depth, normals", lambda: model(images, heads=GEOMETRY_HEADS), options.runs)
+    if options.backward:
+        report("trunk forward + backward", lambda: backward(False), options.runs)
+        report("full forward + backward", lambda: backward(True), options.runs)
 
 
 if __name__ == "__main__":
