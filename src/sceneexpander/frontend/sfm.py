@@ -160,12 +160,12 @@ def _known_cameras(setup: _Setup, intrinsics_px: Tensor | None, world_from_cam: 
             )
         intrinsics = intrinsics * np.array([1 / setup.scale_xy[0], 1 / setup.scale_xy[1], 1.0])[:, None]
     cam_from_world = np.tile(np.eye(4), (views, 1, 1))
-    posed: np.ndarray = np.zeros(views, bool)
+    posed = np.zeros(views, bool)
     if world_from_cam is not None:
         given = world_from_cam.detach().cpu().numpy().astype(np.float64)
         if given.shape != (views, 4, 4):
             raise ValueError(f"known_world_from_cam must be ({views}, 4, 4), is {given.shape}")
-        posed = np.isfinite(given).all((1, 2))
+        posed = np.asarray(np.isfinite(given).all((1, 2)))
         for view in np.flatnonzero(posed):
             rotation = given[view, :3, :3]
             if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:

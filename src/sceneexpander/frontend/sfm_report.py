@@ -84,7 +84,7 @@ def _normalised(mapping: Mapping) -> tuple[np.ndarray, np.ndarray, float]:
         for view in np.flatnonzero(mapping.registered)
         if len(rows := np.flatnonzero(mapping.active[:, view] & mapping.valid))
     ]
-    seen_first = np.flatnonzero(mapping.active[:, 0] & mapping.valid) if mapping.registered[0] else []
+    seen_first = np.flatnonzero(mapping.active[:, 0] & mapping.valid & mapping.registered[0])
     scale = 1.0
     if len(seen_first):
         scale = 1.0 / float(np.median(points[seen_first, 2]))
