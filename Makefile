@@ -46,7 +46,7 @@ test-pipeline: .venv/.stamp
 	pytest tests/pipeline
 
 ui: .venv/.stamp ## Runs in the browser (loopback only)
-	$(PY) -m sceneexpander.tracking.ui
+	$(PY) -m sceneexpander.ui
 
 # make expand PHOTOS=folder INSERTED=picture.png PROMPT="Behind the table is a bench."
 # The values reach the shell as environment variables, so quotes in a sentence need no escaping.

@@ -1,4 +1,4 @@
-"""``python -m sceneexpander.tracking.ui``: MLflow's interface over the local store, on loopback only."""
+"""``python -m sceneexpander.ui``: MLflow's interface over the local store, on loopback only."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sceneexpander.tracking.store import database_path, quiet_environment, track
 @entry_point
 def main() -> None:
     """Start the server and print a link that opens the charts."""
-    parser = argparse.ArgumentParser(prog="python -m sceneexpander.tracking.ui", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m sceneexpander.ui", description=__doc__)
     parser.add_argument("--port", type=int, default=5000)
     port = parser.parse_args().port
     root = find_project()

@@ -1,0 +1,105 @@
+"""dvc.yaml says what the stages do: parameters are the declared sections, and paths are the layout's."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from stages import layout
+from stages.fingerprint import stage_names
+
+ROOT = Path(__file__).parents[3]
+PIPELINE: dict[str, Any] = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
+CONFIG = "outputs/${item.scene}/config.yaml"
+# resolve makes the configuration; the gathering stages get it through the artefacts of the scenes.
+WITHOUT_SECTIONS = {"code", "resolve", "collect", "report", "track"}
+
+
+def tracked(stage: str, file: str) -> list[str]:
+    for entry in PIPELINE[stage].get("params", []):
+        if isinstance(entry, dict) and file in entry:
+            return list(entry[file])
+    return []
+
+
+def paths(stage: str, kind: str) -> list[str]:
+    return [next(iter(item)) if isinstance(item, dict) else item for item in PIPELINE[stage].get(kind, [])]
+
+
+def test_every_stage_file_is_a_stage_and_the_other_way_round() -> None:
+    assert set(PIPELINE) == {*stage_names(ROOT / "stages"), "code"}
+
+
+@pytest.mark.parametrize("stage", sorted(set(PIPELINE) - {"code"}))
+def test_a_stage_depends_on_its_own_code(stage: str) -> None:
+    assert tracked(stage, "outputs/code.json") == [stage]
+
+
+@pytest.mark.parametrize("stage", sorted(set(PIPELINE) - WITHOUT_SECTIONS))
+def test_parameters_are_the_sections_that_the_stage_reads(stage: str) -> None:
+    sections = importlib.import_module(f"stages.{stage}").Sections
+    assert tracked(stage, CONFIG) == [f.name for f in fields(sections)]
+
+
+def filled(path: str) -> str:
+    for field, value in (("scene", "S"), ("round.k", "2"), ("round.prev", "1"), ("method", "backbone")):
+        path = path.replace("${item." + field + "}", value)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("stage", "written"),
+    [
+        ("resolve", [layout.config("S")]),
+        ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
+        ("reconstruct", [layout.state("S", 0), layout.statistics("reconstruct", "S")]),
+        ("generate_view", [layout.inserted("S", 2), layout.statistics("generate_view", "S", 2)]),
+        (
+            "precompute_anchors",
+            [
+                layout.anchors("S", 2),
+                layout.reconstruction("S", 2, "captured").parent,
+                layout.statistics("precompute_anchors", "S", 2),
+            ],
+        ),
+        (
+            "reconstruct_inserted",
+            [
+                layout.reconstruction("S", 2, "backbone").parent,
+                layout.joint_priors("S", 2),
+                layout.statistics("reconstruct_inserted", "S", 2),
+            ],
+        ),
+        ("adapt", [layout.state("S", 2), layout.statistics("adapt", "S", 2)]),
+        ("render", [layout.renders("S", 2, "backbone"), layout.statistics("render", "S", 2, "backbone")]),
+        ("evaluate", [layout.metrics("S", 2, "backbone"), layout.statistics("evaluate", "S", 2, "backbone")]),
+        ("collect", [layout.PAGES / "S"]),
+        ("report", [layout.REPORT, Path("results/metrics.json")]),
+    ],
+)
+def test_outputs_are_where_the_layout_says(stage: str, written: list[Path]) -> None:
+    declared = {filled(path) for path in paths(stage, "outs") + paths(stage, "metrics")}
+    assert declared == {path.as_posix() for path in written}
+
+
+def test_resume_points_are_no_outputs_and_nothing_persists_but_the_marker() -> None:
+    persistent = [
+        (stage, path)
+        for stage, content in PIPELINE.items()
+        for item in content.get("outs", [])
+        if isinstance(item, dict)
+        for path, options in item.items()
+        if options.get("persist")
+    ]
+    assert persistent == [("track", "mlflow/tracked.json")]
+
+
+def test_selected_methods_exist() -> None:
+    params = yaml.safe_load((ROOT / "params.yaml").read_text())
+    assert set(params["methods"]) <= set(layout.METHODS)
+    assert [item["prev"] for item in params["rounds"]] == [item["k"] - 1 for item in params["rounds"]]

@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Literal
+
+import pytest
+
+from sceneexpander.config.parse import ConfigError, parse_dataclass
+from sceneexpander.errors import UserError
+
+
+class Colour(StrEnum):
+    RED = "red"
+    BLUE = "blue"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inner:
+    rate: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.rate < 0:
+            raise ValueError(f"rate must be >= 0, is {self.rate}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outer:
+    steps: int
+    name: str
+    flag: bool
+    colour: Colour
+    mode: Literal["a", "b"]
+    pair: tuple[float, float]
+    many: tuple[int, ...]
+    maybe: str | None
+    inner: Inner = field(default_factory=Inner)
+
+
+GOOD: dict[str, Any] = {
+    "steps": 3,
+    "name": "x",
+    "flag": False,
+    "colour": "blue",
+    "mode": "b",
+    "pair": [1, 2.5],
+    "many": [],
+    "maybe": None,
+    "inner": {"rate": 1},
+}
+
+
+def test_every_kind_of_field() -> None:
+    parsed = parse_dataclass(Outer, GOOD)
+    assert parsed == Outer(
+        steps=3,
+        name="x",
+        flag=False,
+        colour=Colour.BLUE,
+        mode="b",
+        pair=(1.0, 2.5),
+        many=(),
+        maybe=None,
+        inner=Inner(rate=1.0),
+    )
+    assert isinstance(parsed.inner.rate, float)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stepz": 3}, "stepz: unknown key; did you mean 'steps'?"),
+        ({"inner": {"rat": 1}}, "inner.rat: unknown key; did you mean 'rate'?"),
+        ({"steps": 3.0}, "steps: is 3.0 (float), expected a whole number"),
+        ({"steps": True}, "steps: is True (bool), expected a whole number"),
+        ({"steps": "3"}, "steps: is '3' (str), expected a whole number"),
+        ({"flag": 1}, "flag: is 1 (int), expected true or false"),
+        ({"name": None}, "name: is empty, expected text"),
+        ({"name": "???"}, "name: has no value; set it in conf/ or as an override"),
+        ({"colour": "rad"}, "colour: is 'rad'; did you mean 'red'?"),
+        ({"mode": "c"}, "mode: is 'c'; known: a, b"),
+        ({"pair": [1]}, "pair: has 1 entries, expected 2"),
+        ({"many": [1, "2"]}, "many[1]: is '2' (str), expected a whole number"),
+        ({"many": 4}, "many: is 4 (int), expected a list"),
+        ({"inner": 4}, "inner: is 4 (int), expected a section with keys"),
+        ({"inner": {"rate": -1}}, "inner: rate must be >= 0, is -1.0"),
+    ],
+)
+def test_one_line_that_names_the_key(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_dataclass(Outer, {**GOOD, **change})
+    assert caught.value.line() == message
+
+
+@pytest.mark.parametrize("key", sorted(GOOD))
+def test_a_default_in_the_type_does_not_excuse_a_missing_key(key: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_dataclass(Outer, {name: value for name, value in GOOD.items() if name != key})
+    assert caught.value.line().startswith(f"{key}: missing key")
+
+
+def test_a_rooms_own_message_gets_the_section_that_holds_it() -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Room:
+        side: int
+
+        def __post_init__(self) -> None:
+            raise UserError("is odd", where="ingest.side", fix="use 2")
+
+    with pytest.raises(ConfigError) as caught:
+        parse_dataclass(Room, {"side": 1}, where="scene")
+    assert caught.value.line() == "scene.side: is odd; use 2"

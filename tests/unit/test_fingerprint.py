@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sceneexpander.fingerprint import FingerprintError, SourceTree
+
+FILES = {
+    "pkg/__init__.py": "",
+    "pkg/a.py": "from pkg import b\n\ndef f():\n    return b.g()\n",
+    "pkg/b.py": "def g():\n    from .room.c import VALUE\n    return VALUE\n",
+    "pkg/room/__init__.py": "",
+    "pkg/room/c.py": "VALUE = 1\n",
+    "pkg/room/weights/w.bin": "bytes",
+    "pkg/unused.py": "import os\n",
+    "pkg/other/__init__.py": "",
+    "pkg/other/data.txt": "x",
+}
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> SourceTree:
+    for name, text in FILES.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return SourceTree(packages={"pkg": tmp_path / "pkg"})
+
+
+def edit(tree: SourceTree, name: str, text: str) -> None:
+    (tree.packages["pkg"].parent / name).write_text(text)
+
+
+def test_closure_follows_function_level_and_relative_imports(tree: SourceTree) -> None:
+    assert tree.closure("pkg.a") == ["pkg", "pkg.a", "pkg.b", "pkg.room", "pkg.room.c"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("pkg/room/c.py", '"""A docstring."""\n\n# a comment\nVALUE = (\n    1\n)\n'),
+        ("pkg/b.py", 'def g():\n    """What g does."""\n    from .room.c import VALUE  # why\n\n    return VALUE\n'),
+        ("pkg/unused.py", "import sys\n"),
+        ("pkg/other/data.txt", "y"),
+    ],
+)
+def test_what_means_the_same_or_is_not_used_changes_nothing(tree: SourceTree, name: str, text: str) -> None:
+    before = tree.fingerprint("pkg.a")
+    edit(tree, name, text)
+    assert tree.fingerprint("pkg.a") == before
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("pkg/room/c.py", "VALUE = 2\n"),
+        ("pkg/__init__.py", "SWITCH = True\n"),
+        ("pkg/room/weights/w.bin", "other"),
+        ("pkg/room/weights/more.bin", "new"),
+    ],
+)
+def test_what_is_used_counts_down_to_data_files(tree: SourceTree, name: str, text: str) -> None:
+    before = tree.fingerprint("pkg.a")
+    edit(tree, name, text)
+    assert tree.fingerprint("pkg.a") != before
+
+
+def test_a_computed_import_must_be_declared(tree: SourceTree) -> None:
+    dynamic = "import importlib\n\ndef load(name):\n    return importlib.import_module(name)\n"
+    edit(tree, "pkg/b.py", dynamic)
+    with pytest.raises(FingerprintError, match=r"b\.py:4.*DYNAMIC_IMPORTS"):
+        tree.fingerprint("pkg.a")
+    edit(tree, "pkg/b.py", 'DYNAMIC_IMPORTS = ("pkg.room.c",)\n' + dynamic)
+    assert "pkg.room.c" in tree.closure("pkg.a")
+
+
+def test_the_projects_own_stages_have_a_closure() -> None:
+    root = Path(__file__).parents[2]
+    ours = SourceTree(packages={"sceneexpander": root / "src" / "sceneexpander", "stages": root / "stages"})
+    adapt, prepare = ours.closure("stages.adapt"), ours.closure("stages.prepare")
+    assert {"sceneexpander.adaptation.loop", "sceneexpander.models.registry", "stages.runner"} <= set(adapt)
+    # An edit of the adaptation must not prepare every scene again, nor one of the report adapt again.
+    assert not any(name.startswith(("sceneexpander.adaptation", "sceneexpander.models")) for name in prepare)
+    assert not any(name.startswith(("sceneexpander.report", "sceneexpander.tracking")) for name in adapt)

@@ -1,0 +1,96 @@
+"""The arrows between the rooms point one way."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "src" / "sceneexpander"
+
+# What each room may import besides itself and `errors`.
+ROOMS: dict[str, set[str]] = {
+    "geometry": set(),
+    "artifacts": {"geometry"},
+    "frontend": {"geometry"},
+    "synthetic": {"geometry"},
+    "splatting": {"geometry"},
+    "models": {"geometry", "frontend", "splatting", "synthetic"},  # the last two: training of the embedded model
+    "ingest": {"artifacts", "geometry"},
+    "generation": {"artifacts", "geometry", "ingest", "splatting"},
+    "adaptation": {"artifacts", "geometry", "models", "splatting"},
+    "expansion": {"adaptation", "artifacts", "frontend", "geometry", "models"},
+    "evaluation": {"artifacts", "geometry", "splatting"},
+    "rendering": {"artifacts", "evaluation", "geometry", "splatting"},
+    "tracking": {"artifacts", "evaluation"},
+    "report": {"artifacts", "evaluation"},
+    "conformance": {"artifacts", "geometry", "models", "splatting"},  # a command: runs recorded cases
+}
+# Entry points and what only they share: they may import every room, and no room imports them.
+TOP = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__", "errors"} | {"config"}
+ENTRY_ONLY_LIBRARIES = {"dvc", "hydra", "omegaconf"}
+
+
+def imports(path: Path) -> Iterator[str]:
+    package = ("sceneexpander", *path.relative_to(PACKAGE).parent.parts)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+            module = ".".join(part for part in (base, node.module or "") if part)
+            yield module
+            if module == "sceneexpander":
+                yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+def rooms_imported(path: Path) -> set[str]:
+    ours = (name.split(".")[1] for name in imports(path) if name.startswith("sceneexpander."))
+    return set(ours) - {"errors"}
+
+
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0]
+
+
+def test_every_room_is_listed() -> None:
+    found = {path.name for path in PACKAGE.iterdir() if path.is_dir() and any(path.glob("*.py"))}
+    assert found == {*ROOMS, "config"}
+
+
+def test_the_rules_have_no_cycle() -> None:
+    done: set[str] = set()
+    while len(done) < len(ROOMS):
+        ready = {room for room, allowed in ROOMS.items() if room not in done and allowed <= done}
+        assert ready, f"these rooms import each other: {set(ROOMS) - done}"
+        done |= ready
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_no_file_imports_upwards(path: Path) -> None:
+    room = room_of(path)
+    allowed = set(ROOMS) if room == "config" else ROOMS[room]
+    assert rooms_imported(path) - {room} <= allowed
+
+
+def test_errors_imports_nothing_of_ours() -> None:
+    assert not [name for name in imports(PACKAGE / "errors.py") if name.startswith("sceneexpander")]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_no_room_knows_the_pipeline(path: Path) -> None:
+    libraries = {name.split(".")[0] for name in imports(path)}
+    assert "stages" not in libraries
+    if room_of(path) != "config":
+        assert not libraries & ENTRY_ONLY_LIBRARIES
+        assert not rooms_imported(path) & TOP
+        assert "params.yaml" not in path.read_text(encoding="utf-8") or room_of(path) == "artifacts"
+
+
+def test_the_walk_sees_imports_at_all() -> None:
+    assert "geometry" in rooms_imported(PACKAGE / "artifacts" / "reconstruction.py")
