@@ -71,15 +71,15 @@ class DenseConfig:
     segment_tolerances: tuple[float, ...] = (0.8, 2.0)  # colour segments, fine and coarse
     min_segment_px: int = 40  # smallest segment (at 320 pixels; scaled by area)
     plane_tolerance: float = 0.1  # relative error at which a sample stops supporting a segment's plane
-    min_plane_support: float = 0.35  # planes with less support are not used
-    plane_weights: tuple[float, ...] = (0.3, 0.12)  # weight of a fully supported plane in the final fill, per scale
+    min_plane_support: float = 0.6  # planes with less support are not used
+    plane_weights: tuple[float, ...] = (0.1, 0.04)  # weight of a fully supported plane in the final fill, per scale
     smooth_reach: float = 0.054  # reach of the final fill as a share of the long side
-    stiffness: float = 1.0  # smoothness of the final fill against weights of 1
+    stiffness: float = 4.0  # smoothness of the final fill against weights of 1
     colour_sigma: float = 0.04  # colour step that stops the final fill
     weight_agreed: float = 1.0  # confident, two or more other views agree
     weight_confident: float = 0.6  # confident, one other view agrees
     weight_raw: float = 0.001  # matched but not confident
-    weight_point: float = 30.0  # sparse points
+    weight_point: float = 30.0  # sparse points: one speaks for the plain area around it, too
     weight_interpolation: float = 0.003  # interpolation of the sparse points
 
 
@@ -112,7 +112,7 @@ def dense_depth(
     sparse: SparsePoints,
     config: DenseConfig,
     *,
-    posed: Bool[Tensor, "view"] | None = None,
+    posed: Bool[Tensor, view] | None = None,
 ) -> DenseDepth:
     """Depth of every pixel of every view, from images, cameras and sparse points in the same world.
 
@@ -141,7 +141,7 @@ def dense_depth(
         return _match_view(views, s, limits[s], interpolated[s], config)
 
     matched = _each(match, count, config.threads)
-    depths = [None if m is None else 1 / m.inverse_depth for m in matched]
+    depths = [None if m is None else np.reciprocal(m.inverse_depth) for m in matched]
 
     def finish(s: int) -> tuple[Image32, NDArray[np.float32]]:
         agreement = None
@@ -223,7 +223,7 @@ def _match_view(
     at = refined.index[:, None]
     inverse_depth = np.take_along_axis(hypotheses, at, axis=1)[:, 0]
     inverse_depth += refined.offset * np.float32(offsets[1] - offsets[0])
-    cost = np.take_along_axis(volume, at, axis=1)[:, 0].astype(np.float32) / COST_SCALE
+    cost = np.take_along_axis(volume, at, axis=1)[:, 0].astype(np.float32) / np.float32(COST_SCALE)
     floor = np.float32(0.5 * limits[0])
     return _Matched(inverse_depth=np.maximum(inverse_depth, floor), cost=cost, ambiguity=best.ambiguity)
 

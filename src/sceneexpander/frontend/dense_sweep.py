@@ -77,9 +77,7 @@ class WindowMatcher:
                 image /= self._map_z
                 image += np.float32(_PAD - 0.5)
             self._map_x[behind] = -10
-            cv2.remap(
-                padded, self._map_x, self._map_y, cv2.INTER_LINEAR, self._warped, cv2.BORDER_CONSTANT, _OUTSIDE
-            )
+            cv2.remap(padded, self._map_x, self._map_y, cv2.INTER_LINEAR, self._warped, cv2.BORDER_CONSTANT, _OUTSIDE)
             costs.append(self._correlate())
         return _mean_of_better_half(costs)
 

@@ -171,8 +171,8 @@ def _samples(
     rows, columns = rows[all_index[order]], columns[all_index[order]]
     return (
         all_segments[order],
-        columns + 0.5,
-        rows + 0.5,
+        columns.astype(np.float64) + 0.5,
+        rows.astype(np.float64) + 0.5,
         inverse_depth[rows, columns].astype(np.float64),
         weight[rows, columns].astype(np.float64),
     )

@@ -88,7 +88,7 @@ def _merge(graph: _Graph, *, tolerance: float | None = None, min_size: int = 0) 
     joined = coo_matrix((np.ones(len(chosen), np.int8), (a, b)), shape=(regions, regions))
     count, renamed = connected_components(joined, directed=False)
     graph.label = renamed[graph.label].astype(np.int32)
-    graph.size = np.bincount(renamed, weights=graph.size, minlength=count)
+    graph.size = np.bincount(renamed, weights=graph.size, minlength=count).astype(np.float64)
     graph.colour = np.stack([np.bincount(renamed, weights=c, minlength=count) for c in graph.colour.T], axis=-1)
     a, b = renamed[graph.a].astype(np.int64), renamed[graph.b].astype(np.int64)
     between = a != b

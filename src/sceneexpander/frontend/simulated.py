@@ -37,7 +37,7 @@ def sample_sparse_points(
         valid: where ``depth`` is known; nothing is drawn elsewhere.
         per_view: least and greatest number of points drawn from one view (uniform, one number for the scene).
     """
-    views, _, height, width = images.shape
+    views, width = images.shape[0], images.shape[3]
     count = int(torch.randint(per_view[0], per_view[1] + 1, (), generator=generator))
     chance = _gradient(images) * valid.float()
     points, view_index, point_index, pixels = [], [], [], []
@@ -92,11 +92,11 @@ def _gradient(images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "vi
 
 def _seen(
     xy: Float[Tensor, "point 2"],
-    z: Float[Tensor, "point"],
+    z: Float[Tensor, point],
     depth: Float[Tensor, "height width"],
     valid: Bool[Tensor, "height width"],
     tolerance: float,
-) -> Int[Tensor, "seen"]:
+) -> Int[Tensor, seen]:
     """Indices of the points that are in the frame and not behind the visible surface."""
     height, width = depth.shape
     column, row = xy[:, 0].floor().long(), xy[:, 1].floor().long()
