@@ -1,5 +1,8 @@
 """Make the bundled scene ``scenes/courtyard``: pictures and truth of a hand-designed courtyard.
 
+The defaults made the folder in the repository. ``--supersample 2 --ambient-samples 3`` gives smoother edges and contact
+shadows for several times the computation; the truth (cameras, depth, masks) does not depend on either.
+
 Usage: python scripts/make_courtyard.py [--out scenes/courtyard] [--width 768] [--height 576]
 """
 
@@ -18,8 +21,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("scenes/courtyard"), help="folder to write")
     parser.add_argument("--width", type=int, default=768)
     parser.add_argument("--height", type=int, default=576)
-    parser.add_argument("--supersample", type=float, default=2.0, help="colour samples per pixel side")
-    parser.add_argument("--ambient-samples", type=int, default=3, help="occlusion rays per pixel; 0 = none")
+    parser.add_argument("--supersample", type=float, default=1.25, help="colour samples per pixel side")
+    parser.add_argument("--ambient-samples", type=int, default=0, help="occlusion rays per pixel; 0 = none")
     args = parser.parse_args()
     if min(args.width, args.height) < 16:
         raise UserError(f"is {args.width}x{args.height}", where="--width/--height", fix="use at least 16 pixels a side")

@@ -6,6 +6,7 @@
 
 from sceneexpander.synthetic.degrade import auto_exposure, degrade, encode_radiance
 from sceneexpander.synthetic.intersect import Shape
+from sceneexpander.synthetic.misalign import MisalignedView, Misalignment, misalign
 from sceneexpander.synthetic.render import RenderedViews, render_world
 from sceneexpander.synthetic.scenes import KINDS, build_world
 from sceneexpander.synthetic.textures import TextureKey
@@ -18,6 +19,8 @@ __all__ = [
     "CameraSet",
     "Light",
     "Material",
+    "MisalignedView",
+    "Misalignment",
     "RenderedViews",
     "Shape",
     "Sky",
@@ -31,5 +34,6 @@ __all__ = [
     "degrade",
     "encode_radiance",
     "make_views",
+    "misalign",
     "render_world",
 ]

@@ -19,7 +19,7 @@ from sceneexpander.synthetic.furniture import (
 )
 from sceneexpander.synthetic.intersect import Shape
 from sceneexpander.synthetic.textures import Split, draw_texture
-from sceneexpander.synthetic.world import Light, Material, Sky, World, WorldBuilder
+from sceneexpander.synthetic.world import Light, Sky, World, WorldBuilder
 
 KINDS: tuple[str, ...] = ("room", "corridor", "open", "table_top", "courtyard")
 _KIND_SHARES = (0.36, 0.14, 0.2, 0.12, 0.18)
@@ -305,6 +305,3 @@ def build_world(generator: np.random.Generator, kind: str, *, split: Split = "tr
     builder = WorldBuilder(kind)
     _RECIPES[kind](builder, Palette(generator, split, float(generator.uniform(0.25, 0.75))))
     return builder.build()
-
-
-__all__ = ["KINDS", "Material", "build_world", "draw_kind"]
