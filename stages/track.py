@@ -11,12 +11,12 @@ from typing import Any
 
 from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_sections, read_yaml
+from sceneexpander.project import SWEEP_ENV
 from sceneexpander.tracking import TrackingConfig, record_runs, scene_runs
 from stages import layout
 from stages.runner import Cell, project_root, stage
 
 MARKER = Path("mlflow/tracked.json")
-SWEEP_ENV = "SCENEEXPANDER_SWEEP"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,7 +19,7 @@ from sceneexpander.errors import UserError, entry_point
 from sceneexpander.ingest import list_pictures, make_round, read_picture, safe_name
 from sceneexpander.preflight import check_scene
 from sceneexpander.project import find_project
-from sceneexpander.workspace import Selection, make_workspace, reproduce
+from sceneexpander.workspace import Selection, make_workspace, merged_overrides, reproduce
 
 SCENE_FILE = "scene.yaml"
 
@@ -126,8 +126,9 @@ def expand(request: Request, *, project: Path) -> Path:
     with tempfile.TemporaryDirectory(prefix="sceneexpander-") as scratch:
         scene = Path(scratch) / name
         stage_scene(request, name, scene)
-        rounds = check_scene(name, scene, conf=project / "conf", overrides=request.overrides)
-        selection = Selection(scenes=(name,), rounds=rounds, overrides=request.overrides)
+        overrides = merged_overrides((), request.overrides)
+        rounds = check_scene(name, scene, conf=project / "conf", overrides=overrides)
+        selection = Selection(scenes=(name,), rounds=rounds, overrides=overrides)
         make_workspace(folder, selection, project=project, scenes={name: scene})
     reproduce(folder, project=project)
     return folder / "outputs" / "report" / "index.html"

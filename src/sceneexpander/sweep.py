@@ -13,12 +13,12 @@ from typing import Any
 from sceneexpander.errors import UserError, entry_point
 from sceneexpander.preflight import check_scene
 from sceneexpander.project import find_project
-from sceneexpander.workspace import Selection, make_workspace, read_selection, reproduce_shared
+from sceneexpander.workspace import Selection, make_workspace, merged_overrides, read_selection, reproduce_shared
 
 KEPT = ("outputs/report", "outputs/pages", "params.yaml", "dvc.lock")  # of a finished job; the rest is in the cache
 
 
-def run_job(folder: Path, overrides: tuple[str, ...], project: Path) -> None:
+def run_job(folder: Path, overrides: tuple[str, ...], project: Path, *, sweep: str | None = None) -> None:
     """One combination: make its workspace, run it, keep its pages.
 
     Raises:
@@ -26,7 +26,10 @@ def run_job(folder: Path, overrides: tuple[str, ...], project: Path) -> None:
     """
     base = read_selection(project)
     selection = Selection(
-        scenes=base.scenes, rounds=base.rounds, methods=base.methods, overrides=(*base.overrides, *overrides)
+        scenes=base.scenes,
+        rounds=base.rounds,
+        methods=base.methods,
+        overrides=merged_overrides(base.overrides, overrides),
     )
     try:
         for scene in selection.scenes:
@@ -38,7 +41,7 @@ def run_job(folder: Path, overrides: tuple[str, ...], project: Path) -> None:
                 rounds=selection.rounds,
             )
         workspace = make_workspace(folder / "workspace", selection, project=project)
-        reproduce_shared(workspace, project=project)
+        reproduce_shared(workspace, project=project, sweep=sweep)
     except UserError as error:
         raise RuntimeError(error.line()) from None
     for name in KEPT:
@@ -61,7 +64,8 @@ def main() -> None:
         settings = HydraConfig.get()
         folder = Path(settings.runtime.output_dir)
         overrides = tuple(item for item in settings.overrides.task if item.partition("=")[0] != "scene")
-        run_job(folder, overrides, project)
+        sweep = None if folder.parent == folder or settings.mode.name == "RUN" else "_".join(folder.parts[-3:-1])
+        run_job(folder, overrides, project, sweep=sweep)
         print(f"{' '.join(overrides) or 'default'}: {folder / 'outputs' / 'report' / 'index.html'}")
 
     if not sys.argv[1:]:

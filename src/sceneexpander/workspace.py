@@ -24,11 +24,12 @@ import yaml
 
 from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.errors import UserError
-from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV, find_project
+from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV, SWEEP_ENV, find_project
 
 COPIED_FOLDERS = ("conf", "src", "stages")
 COPIED_FILES = ("dvc.yaml", ".dvcignore", "pyproject.toml", ".dvc/config")
 ERROR_FILE = "error.txt"
+PATH_KEYS = frozenset({"model.weights", "generator.file"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +50,22 @@ class Selection:
             "overrides": list(self.overrides),
         }
         return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def merged_overrides(base: Sequence[str], more: Sequence[str]) -> tuple[str, ...]:
+    """``base`` followed by ``more``; of several overrides of one key the last stands. Paths of files become absolute.
+
+    A workspace runs in a folder of its own, where a path relative to the user's would name nothing.
+    """
+    by_key = {override.lstrip("+~").partition("=")[0]: override for override in (*base, *more)}
+    return tuple(_with_absolute_path(override) for override in by_key.values())
+
+
+def _with_absolute_path(override: str) -> str:
+    key, _, value = override.partition("=")
+    if key not in PATH_KEYS or not Path(value).expanduser().is_file():
+        return override
+    return f"{key}={Path(value).expanduser().resolve()}"
 
 
 def read_selection(project: Path) -> Selection:
@@ -157,11 +174,17 @@ def reproduce(folder: Path, *, project: Path) -> None:
     _raise_for(code, folder)
 
 
-def reproduce_shared(folder: Path, *, project: Path) -> None:
-    """Like `reproduce`, stage by stage under the project's locks: for workspaces that run at the same time."""
+def reproduce_shared(folder: Path, *, project: Path, sweep: str | None = None) -> None:
+    """Like `reproduce`, stage by stage under the project's locks: for workspaces that run at the same time.
+
+    Runs are tagged with the id of the ``sweep``, if there is one.
+    """
     (folder / ERROR_FILE).unlink(missing_ok=True)
     command = [sys.executable, "-m", "sceneexpander.workspace", str(folder)]
-    _raise_for(run_group(command, cwd=folder, env=workspace_environment(folder, project)), folder)
+    environment = workspace_environment(folder, project)
+    if sweep is not None:
+        environment[SWEEP_ENV] = sweep
+    _raise_for(run_group(command, cwd=folder, env=environment), folder)
 
 
 def _raise_for(code: int, folder: Path) -> None:

@@ -52,11 +52,18 @@ def compose(conf: Path, overrides: Sequence[str]) -> dict[str, Any]:
 @contextmanager
 def _initialised(conf: Path) -> Iterator[None]:
     from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
 
     if not (conf / "config.yaml").is_file():
         raise ConfigError("does not exist", where=conf / "config.yaml")
-    with initialize_config_dir(config_dir=str(conf.resolve()), version_base="1.3"):
-        yield
+    # Inside a sweep's job Hydra is running already; it allows one at a time.
+    current = GlobalHydra.instance()
+    outer, current.hydra = current.hydra, None
+    try:
+        with initialize_config_dir(config_dir=str(conf.resolve()), version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = outer
 
 
 def refuse_forbidden_keys(values: Mapping[str, Any], where: str = "") -> None:

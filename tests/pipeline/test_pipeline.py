@@ -1,0 +1,305 @@
+"""The pipeline as users run it: a tiny scene, real stages, a workspace of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneexpander.workspace import Selection, make_workspace, workspace_environment
+
+pytestmark = pytest.mark.pipeline
+
+ROOT = Path(__file__).parents[2]
+SMOKE = ("profile=smoke", "frontend.sfm.max_features=800")
+ADAPT = ["-m", "stages.adapt", "room", "1", "0"]
+
+
+def textured(seed: int, side: int = 320) -> np.ndarray:
+    """Smooth blobs at several scales: corners everywhere, at any resolution."""
+    generator = np.random.default_rng(seed)
+    picture = np.zeros((side, side, 3))
+    for cells in (8, 24, 64):
+        coarse = Image.fromarray(generator.integers(0, 256, (cells, cells, 3), dtype=np.uint8))
+        picture += np.asarray(coarse.resize((side, side), Image.Resampling.BICUBIC), dtype=np.float64) / 3
+    return picture
+
+
+def parallax_view(shift: float, height: int = 96, width: int = 128) -> Image.Image:
+    """A near square in front of a far wall, seen from a camera that moved sideways by ``shift``."""
+    wall, square = textured(1), textured(2)
+    far, near = round(40 + 6 * shift), round(30 + 18 * shift)
+    picture = wall[40 : 40 + height, far : far + width].copy()
+    left = 48 - round(12 * shift)
+    picture[28:76, left : left + 44] = square[28:76, near + left : near + left + 44]
+    return Image.fromarray(picture.clip(0, 255).astype(np.uint8))
+
+
+def make_scene(folder: Path) -> Path:
+    """Three photos and a picture from further to the side."""
+    (folder / "captured").mkdir(parents=True)
+    (folder / "inserted").mkdir()
+    for index in range(3):
+        parallax_view(0.6 * index).save(folder / "captured" / f"photo_{index}.png")
+    parallax_view(2.4).save(folder / "inserted" / "round_1.png")
+    (folder / "scene.yaml").write_text(
+        'name: room\nrounds:\n  - prompt: "To the right is more of the wall."\n    inserted: inserted/round_1.png\n'
+    )
+    return folder
+
+
+class Project:
+    """A project folder of its own: the sources, one scene, and nothing of the developer's outputs."""
+
+    def __init__(self, folder: Path, overrides: tuple[str, ...] = SMOKE) -> None:
+        self.folder = folder
+        scene = make_scene(folder.parent / f"{folder.name}-scene")
+        selection = Selection(scenes=("room",), rounds=1, overrides=overrides)
+        make_workspace(folder, selection, project=ROOT, scenes={"room": scene})
+        (folder / ".dvc" / "config.local").write_text("[core]\n    no_scm = true\n")
+        self.environment = {**workspace_environment(folder, folder), "OMP_NUM_THREADS": "1"}
+
+    def run(self, *command: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+        done = subprocess.run(
+            [sys.executable, *command],
+            cwd=self.folder,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert not check or done.returncode == 0, done.stdout + done.stderr
+        return done
+
+    def repro(self) -> list[str]:
+        """Run the pipeline; returns the stages that were executed."""
+        return re.findall(r"Running stage '([^']+)'", self.run("-m", "dvc", "repro").stdout)
+
+    def runs(self) -> int:
+        with sqlite3.connect(self.folder / "mlflow" / "mlflow.db") as database:
+            return int(database.execute("SELECT count(*) FROM runs WHERE lifecycle_stage = 'active'").fetchone()[0])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
+    """A project after its first run."""
+    project = Project(tmp_path_factory.mktemp("pipeline") / "project")
+    executed = project.repro()
+    assert executed[0] == "code"
+    assert len(executed) == 16, executed
+    yield project
+    shutil.rmtree(project.folder, ignore_errors=True)
+
+
+def test_everything_that_was_promised_is_there(finished: Project) -> None:
+    outputs = finished.folder / "outputs"
+    page = (outputs / "report" / "index.html").read_text()
+    assert "To the right is more of the wall." in page
+    assert not re.findall(r"(?:src|href)=\"https?:", page), "the page must work offline"
+    for place in re.findall(r'(?:src|poster)="([^"#]+)"', page):
+        assert (outputs / "report" / place).is_file(), place
+    assert "WorldMirror" not in page
+    for method in ("captured", "backbone", "sceneexpander"):
+        renders = outputs / "room" / "round_1" / "renders" / method
+        assert (renders / "rgb.mp4").stat().st_size > 1000
+        metrics = json.loads((outputs / "room" / "round_1" / "metrics" / f"{method}.json").read_text())
+        assert metrics["model"] == "mini"
+        assert 5 < metrics["psnr_db"] < 100
+    numbers = json.loads((finished.folder / "results" / "metrics.json").read_text())
+    assert set(numbers["room"]["round_1"]) == {"captured", "backbone", "sceneexpander"}
+    log = json.loads((outputs / "room" / "round_1" / "sceneexpander" / "log.json").read_text())
+    assert [record["step"] for record in log] == [1, 2, 3, 4]
+
+
+def test_nothing_changed_runs_nothing(finished: Project) -> None:
+    assert finished.repro() == []
+
+
+def test_a_comment_reruns_no_work_and_code_reruns_what_uses_it(finished: Project) -> None:
+    source = finished.folder / "src" / "sceneexpander" / "report" / "words.py"
+    before = source.read_text()
+    try:
+        source.write_text(before + "\n# a comment\n")
+        assert finished.repro() == ["code"]
+        source.write_text(before + "\nUNUSED = 1\n")
+        assert finished.repro() == ["code", "report", "track"]
+    finally:
+        source.write_text(before)
+        finished.repro()
+
+
+def test_tracking_is_complete_and_records_once(finished: Project) -> None:
+    assert finished.runs() == 3
+    shutil.rmtree(finished.folder / "mlflow")
+    assert finished.repro() == ["track"], "everything else comes from the cache"
+    assert finished.runs() == 3
+    finished.run("-m", "stages.track")
+    assert finished.runs() == 3
+
+
+def test_a_setting_reruns_only_what_reads_it(finished: Project) -> None:
+    params = finished.folder / "params.yaml"
+    before = params.read_text()
+    try:
+        params.write_text(before.replace("- profile=smoke", "- profile=smoke\n- ablation=baseline"))
+        executed = finished.repro()
+    finally:
+        params.write_text(before)
+    assert executed == [
+        "resolve@room",
+        "adapt@room-round0",
+        "render@room-round0-sceneexpander",
+        "evaluate@room-round0-sceneexpander",
+        "collect@room",
+        "report",
+        "track",
+    ]
+    assert finished.runs() == 6
+    assert finished.repro() == ["track"], "going back is restored"
+    assert finished.runs() == 6
+
+
+def test_a_killed_adaptation_resumes_with_the_same_bits(finished: Project) -> None:
+    state = finished.folder / "outputs" / "room" / "round_1" / "sceneexpander"
+    whole = (state / "weights" / "tensors.safetensors").read_bytes()
+    log = (state / "log.json").read_bytes()
+    checkpoints = finished.folder / ".cache" / "ckpt"
+    # Stopped by a breakpoint in the library's own checkpoint writer: no guessing of times.
+    script = (
+        "import os, signal, sys\n"
+        "from sceneexpander.adaptation.checkpoint import Checkpoint\n"
+        "write = Checkpoint.save\n"
+        "def save(self, folder):\n"
+        "    write(self, folder)\n"
+        "    if self.step == 2: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "Checkpoint.save = save\n"
+        "sys.argv = ['adapt', 'room', '1', '0']\n"
+        "from stages.adapt import main\n"
+        "main()\n"
+    )
+    killed = finished.run("-c", script, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert len(list(checkpoints.iterdir())) == 1, "the resume point survives"
+    assert (state / "log.json").read_bytes() == log, "the earlier result is untouched"
+    resumed = finished.run(*ADAPT)
+    assert "resumed the adaptation after step 2" in resumed.stderr
+    assert (state / "weights" / "tensors.safetensors").read_bytes() == whole
+    assert (state / "log.json").read_bytes() == log
+    assert not list(checkpoints.iterdir()), "finished work leaves no resume point"
+
+
+def broken_photo(scene: Path) -> str:
+    path = scene / "captured" / "photo_1.png"
+    path.write_bytes(path.read_bytes()[:200])
+    return "photo_1.png"
+
+
+def one_photo(scene: Path) -> str:
+    for index in (1, 2):
+        (scene / "captured" / f"photo_{index}.png").unlink()
+    return "captured"
+
+
+def no_prompt(scene: Path) -> str:
+    (scene / "scene.yaml").write_text("name: room\nrounds:\n  - inserted: inserted/round_1.png\n")
+    return "prompt"
+
+
+@pytest.mark.parametrize("damage", [broken_photo, one_photo, no_prompt])
+def test_bad_input_is_one_line_and_leaves_results_alone(finished: Project, damage, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    scene = finished.folder / "scenes" / "room"
+    backup = tmp_path / "backup"
+    shutil.copytree(scene, backup)
+    page = (finished.folder / "outputs" / "report" / "index.html").read_bytes()
+    try:
+        named = damage(scene)
+        checked = finished.run("-m", "stages.check", check=False)
+        staged = finished.run("-m", "stages.prepare", "room", check=False)
+    finally:
+        shutil.rmtree(scene)
+        shutil.copytree(backup, scene)
+    for done in (checked, staged):
+        assert done.returncode == 2
+        errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+        assert len(errors) == 1, done.stderr
+        assert named in errors[0]
+        assert "Traceback" not in done.stderr
+    assert (finished.folder / "outputs" / "report" / "index.html").read_bytes() == page
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["{tmp}/nowhere", "--prompt", "x"], "nowhere: does not exist"),
+        (["{scene}/captured", "--prompt", "A bench."], "--inserted: round 1 has no picture"),
+        (["{scene}/captured", "--inserted", "{scene}/inserted/round_1.png"], "has no prompt"),
+        (["{scene}", "--prompt", "A bench."], "says itself what to add"),
+        (["{scene}", "adapt.stepz=3"], "did you mean 'adapt.steps'?"),
+        (["{scene}", "profile=smoke", "model.weights={tmp}/none.safetensors"], "none.safetensors"),
+    ],
+)
+def test_expand_refuses_before_it_runs_anything(
+    finished: Project, tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    filled = [item.format(tmp=tmp_path, scene=finished.folder / "scenes" / "room") for item in arguments]
+    done = finished.run("-m", "sceneexpander.expand", *filled, check=False)
+    assert done.returncode == 2, done.stderr
+    assert said in done.stderr
+    assert done.stderr.strip().count("\n") == 0, "one line"
+    assert not (finished.folder / "runs").exists()
+
+
+def test_expand_runs_a_folder_of_photos(finished: Project) -> None:
+    """Two photos and a picture; the stages themselves are covered above, so the smallest budget will do."""
+    scene = finished.folder / "scenes" / "room"
+    photos = finished.folder / "photos"
+    photos.mkdir()
+    for index in (0, 2):
+        shutil.copyfile(scene / "captured" / f"photo_{index}.png", photos / f"photo_{index}.png")
+    arguments = ["--inserted", str(scene / "inserted" / "round_1.png"), "--prompt", 'A "wall", further on.']
+    arguments += ["--name", "mine", *SMOKE, "adapt.steps=1", "warmup.steps=0", "render.frames=4"]
+    done = finished.run("-m", "sceneexpander.expand", str(photos), *arguments)
+    page = finished.folder / "runs" / "mine" / "outputs" / "report" / "index.html"
+    assert done.stdout.strip().endswith(f"report: {page}")
+    assert "A &#34;wall&#34;, further on." in page.read_text()
+    assert finished.runs() == 9, "runs of a workspace are tracked in the project"
+
+
+def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_path: Path) -> None:
+    """A sweep's jobs: what another run has made is restored, not made again."""
+    from sceneexpander.workspace import reproduce_shared
+
+    selection = Selection(scenes=("room",), rounds=1, overrides=(*SMOKE, "ablation=restore_interval_1"))
+    folder = make_workspace(tmp_path / "job", selection, project=finished.folder)
+    before = os.environ.copy()
+    os.environ.update(finished.environment)
+    started = time.time()
+    try:
+        reproduce_shared(folder, project=finished.folder)
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+    fresh = set()
+    for path in (folder / "outputs" / "room").rglob("stats/*.json"):
+        if json.loads(path.read_text())["started"] >= started:
+            fresh.add(path.stem)
+    assert fresh == {"adapt", "render-sceneexpander", "evaluate-sceneexpander"}
+
+
+def test_the_pinned_dvc_still_has_what_the_locks_are_named_by() -> None:
+    from dvc.stage import cache
+
+    assert callable(cache._can_hash)
+    assert callable(cache._get_stage_hash)

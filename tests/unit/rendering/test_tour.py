@@ -1,0 +1,114 @@
+"""The tour: all methods fly the same way, each through its own cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.renders import Renders
+from sceneexpander.artifacts.store import ArtifactError
+from sceneexpander.errors import UserError
+from sceneexpander.geometry.camera import camera_vector_from_pose
+from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.rendering import RenderConfig, plan_tour, produce_renders
+
+HEIGHT, WIDTH = 21, 28
+CONFIG = RenderConfig(frames=9, fps=6, stills=3)
+
+
+def reconstruction(method: str, centres: list[float], *, scale: float = 1.0, generated: int = 0) -> Reconstruction:
+    """Cameras on a line that look along +z at a wall of Gaussians; the last ``generated`` views are generated."""
+    views = len(centres)
+    poses = torch.eye(4).repeat(views, 1, 1)
+    poses[:, 0, 3] = scale * torch.tensor(centres)
+    intrinsics = torch.tensor([[25.0, 0, WIDTH / 2], [0, 25.0, HEIGHT / 2], [0, 0, 1]]).repeat(views, 1, 1)
+    is_generated = torch.arange(views) >= views - generated
+    x, y = torch.meshgrid(torch.linspace(-2, 3, 40), torch.linspace(-1, 1, 16), indexing="xy")
+    means = scale * torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), 2.0)], -1)
+    count = len(means)
+    gaussians = Gaussians(
+        means=means,
+        quat_wxyz=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        scales=torch.full((count, 3), 0.08 * scale),
+        opacities=torch.full((count,), 0.9),
+        sh=torch.zeros(count, 1, 3),
+        source_view=torch.zeros(count, dtype=torch.int64),
+        generated=means[:, 0] > 1.5 * scale,
+    )
+    return Reconstruction(
+        method=method,
+        model="mini",
+        weights_sha256="0" * 64,
+        view_ids=tuple(f"v{i}" for i in range(views)),
+        generated=is_generated,
+        posed=torch.ones(views, dtype=torch.bool),
+        camera_vector=camera_vector_from_pose(poses, intrinsics, HEIGHT, WIDTH),
+        world_from_cam=poses,
+        intrinsics_px=intrinsics,
+        depth=torch.full((views, HEIGHT, WIDTH), 2.0 * scale),
+        depth_conf=torch.full((views, HEIGHT, WIDTH), 2.0),
+        normals=torch.tensor([0.0, 0, -1]).expand(views, HEIGHT, WIDTH, 3).clone(),
+        normals_conf=torch.full((views, HEIGHT, WIDTH), 2.0),
+        gaussians=gaussians,
+    )
+
+
+BACKBONE = reconstruction("backbone", [0.0, 0.4, 0.2, 1.5], generated=1)
+
+
+def test_it_starts_and_ends_at_a_captured_camera_and_visits_the_inserted_one() -> None:
+    tour = plan_tour(BACKBONE, BACKBONE, CONFIG)
+    x = tour.world_from_cam[:, 0, 3]
+    # Shortest way to the inserted camera at 1.5: 0.0, 0.2, 0.4, 1.5 and back.
+    torch.testing.assert_close(x[[0, -1]], torch.zeros(2))
+    assert tour.inserted_frame == int(x.argmax())
+    torch.testing.assert_close(tour.world_from_cam[tour.inserted_frame], BACKBONE.world_from_cam[3])
+    torch.testing.assert_close(x, x.flip(0), atol=1e-5, rtol=0)
+    assert tour.inserted_camera == "backbone"
+
+
+def test_before_the_insertion_the_camera_comes_from_the_reference_in_this_gauge() -> None:
+    captured = reconstruction("captured", [0.0, 0.4, 0.2], scale=3.0)
+    tour = plan_tour(captured, BACKBONE, CONFIG)
+    assert tour.inserted_camera == "backbone"
+    # The reference's camera at 1.5 stands at 4.5 where every length is three times as long.
+    torch.testing.assert_close(tour.world_from_cam[tour.inserted_frame, 0, 3], torch.tensor(4.5), atol=1e-3, rtol=0)
+
+
+def test_views_without_a_camera_are_not_visited() -> None:
+    lost = replace(BACKBONE, posed=torch.tensor([True, False, True, True]))
+    tour = plan_tour(lost, lost, CONFIG)
+    stops = (tour.world_from_cam[:, 0, 3, None] - torch.tensor([0.0, 0.2, 1.5])).abs().min(0).values
+    torch.testing.assert_close(stops, torch.zeros(3), atol=1e-5, rtol=0)
+
+
+def test_what_is_written_is_complete_and_reads_back(tmp_path: Path) -> None:
+    done = produce_renders(BACKBONE, BACKBONE, CONFIG, tmp_path)
+    read = Renders.load(tmp_path)
+    assert read.videos == done.videos == {name: f"{name}.mp4" for name in ("rgb", "depth", "provenance")}
+    assert read.frames == 9
+    assert done.inserted_frame in [index for index, _ in read.stills]
+    assert [view for view, _ in read.views] == ["v0", "v1", "v2", "v3"]
+    torch.testing.assert_close(read.world_from_cam, done.world_from_cam)
+    (tmp_path / "rgb.mp4").unlink()
+    with pytest.raises(ArtifactError, match=r"rgb\.mp4: is missing"):
+        Renders.load(tmp_path)
+
+
+def test_renders_repeat_bit_for_bit(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        produce_renders(BACKBONE, BACKBONE, CONFIG, tmp_path / name)
+    names = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
+    assert len(names) > 10
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    with pytest.raises(UserError, match=r"render\.frames: must be >= 2, is 1"):
+        RenderConfig(frames=1)
