@@ -79,6 +79,38 @@ SX_INLINE float lane_sum(Vec v) {
   return lanes[0];
 }
 
+// out[i] = sum of the lanes of v[i]. Eight vectors at a time by adding shuffled pairs, where the compiler has shuffles.
+template <int N>
+SX_INLINE void lane_sums(const Vec* v, float* out) {
+  int done = 0;
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+  typedef float Oct __attribute__((vector_size(32)));
+  for (; kLanes >= 8 && done + 8 <= N; done += 8) {
+    Oct a[8];
+    for (int i = 0; i < 8; ++i) {
+      std::memcpy(&a[i], &v[done + i], sizeof(Oct));
+      if (kLanes == 16) {
+        Oct high;
+        std::memcpy(&high, reinterpret_cast<const char*>(&v[done + i]) + (sizeof(Vec) - sizeof(Oct)), sizeof(Oct));
+        a[i] += high;
+      }
+    }
+    for (int i = 0; i < 4; ++i)
+      a[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 8, 2, 10, 4, 12, 6, 14) +
+             __builtin_shufflevector(a[2 * i], a[2 * i + 1], 1, 9, 3, 11, 5, 13, 7, 15);
+    for (int i = 0; i < 2; ++i)
+      a[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 8, 9, 4, 5, 12, 13) +
+             __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 3, 10, 11, 6, 7, 14, 15);
+    a[0] = __builtin_shufflevector(a[0], a[1], 0, 1, 2, 3, 8, 9, 10, 11) +
+           __builtin_shufflevector(a[0], a[1], 4, 5, 6, 7, 12, 13, 14, 15);
+    std::memcpy(out + done, &a[0], sizeof(Oct));
+  }
+#endif
+#endif
+  for (; done < N; ++done) out[done] = lane_sum(v[done]);
+}
+
 // 2^t by a polynomial on [-1/2, 1/2] (relative error 7.5e-8); meaningless below t = -126, where callers mask it.
 SX_INLINE Vec exp2_vec(Vec t) {
   const Vec magic = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer, held in the low mantissa bits
@@ -652,10 +684,10 @@ void blend_tile_backward(const SxScene& s, const Record<NC>* records, const uint
     if (i % kDoneEvery == 0 && i > 0 && finished(t)) break;
     const Record<NC>& g = records[entries[i]];
     const Box box(g, area);
-    float sums[kMoments + NC] = {};
+    Vec moments[kMoments] = {}, d_feature[NC] = {};
     for (int x = box.x0; x < box.x1; x += kLanes) {
       const Window window(g, area.x + x);
-      Vec m0{}, m1{}, m2{}, d_feature[NC] = {};
+      Vec m0{}, m1{}, m2{};
       for (int y = box.y0; y < box.y1; ++y) {
         const int at = y * kStride + x;
         const float dy = static_cast<float>(area.y + y) + 0.5f - g.v;
@@ -683,11 +715,13 @@ void blend_tile_backward(const SxScene& s, const Record<NC>* records, const uint
         m0 += v, m1 += v_dy, m2 += v_dy * dy;
       }
       const Vec m0_dx = m0 * window.dx;
-      sums[0] += lane_sum(m0), sums[1] += lane_sum(m0_dx), sums[2] += lane_sum(m1);
-      sums[3] += lane_sum(m0_dx * window.dx), sums[4] += lane_sum(m1 * window.dx), sums[5] += lane_sum(m2);
-      for (int c = 0; c < NC; ++c) sums[kMoments + c] += lane_sum(d_feature[c]);
+      moments[0] += m0, moments[1] += m0_dx, moments[2] += m1;
+      moments[3] += m0_dx * window.dx, moments[4] += m1 * window.dx, moments[5] += m2;
     }
-    std::memcpy(slot_of(entries[i]), sums, sizeof sums);
+    Vec all[kMoments + NC];
+    std::copy(moments, moments + kMoments, all);
+    std::copy(d_feature, d_feature + NC, all + kMoments);
+    lane_sums<kMoments + NC>(all, slot_of(entries[i]));
   }
   for (; i < n; ++i) std::memset(slot_of(entries[i]), 0, sizeof(float) * (kMoments + NC));
 }
