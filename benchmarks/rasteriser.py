@@ -33,7 +33,7 @@ from sceneexpander.splatting import RasterSettings, rasterise
 from sceneexpander.splatting.kernel_backend import load_kernel
 
 SCENES = {
-    "S": (384, 288, 256, 192),
+    "S": (256, 192, 256, 192),
     "M": (448, 336, 512, 384),
     "T": (96, 72, 96, 72),
 }  # source, target width and height
