@@ -125,4 +125,4 @@ class Trace:
         for j, layer in enumerate(head.get_submodule("resize_layers").children()):
             self._output(layer, f"{name}.level{j}")
         self._output(head.get_submodule("scratch.output_conv1"), f"{name}.fused8x")
-        self._output(head.get_submodule("scratch.output_conv2"), f"{name}.logits")
+        self._output(head.get_submodule("scratch.output_conv2.2"), f"{name}.logits")

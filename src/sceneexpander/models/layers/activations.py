@@ -17,6 +17,12 @@ def signed_expm1(logits: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return torch.sign(logits) * torch.expm1(logits.abs())
 
 
+def radial_expm1(logits: Float[Tensor, "*shape axis"]) -> Float[Tensor, "*shape axis"]:
+    """``x / |x| (exp|x| - 1)`` over the last axis: points and translations of CUT3R (ttt3r spec 6)."""
+    length = logits.norm(dim=-1, keepdim=True)
+    return logits / length.clamp(min=1e-8) * torch.expm1(length)
+
+
 def unit_vector(logits: Float[Tensor, "*shape axis"]) -> Float[Tensor, "*shape axis"]:
     """``x / |x|`` over the last axis, without an epsilon: normals."""
     return logits / logits.norm(dim=-1, keepdim=True)

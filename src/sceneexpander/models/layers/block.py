@@ -48,7 +48,8 @@ class Block(nn.Module):
         mlp_ratio: hidden width of the MLP over ``dim``.
         norm_eps: epsilon of norm1 and norm2 (1e-6 in DINOv2, 1e-5 in trunks and camera heads).
         qk_norm: see `Attention`.
-        layer_scale: initial gain of both LayerScales.
+        layer_scale: initial gain of both LayerScales; None: there are none.
+        half_rope: see `Attention`.
     """
 
     def __init__(
@@ -59,15 +60,16 @@ class Block(nn.Module):
         mlp_ratio: float = 4.0,
         norm_eps: float = 1e-5,
         qk_norm: bool = False,
-        layer_scale: float = 0.01,
+        layer_scale: float | None = 0.01,
+        half_rope: bool = False,
     ) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
-        self.attn = Attention(dim, heads, qk_norm=qk_norm)
-        self.ls1 = LayerScale(dim, init=layer_scale)
+        self.attn = Attention(dim, heads, qk_norm=qk_norm, half_rope=half_rope)
+        self.ls1 = nn.Identity() if layer_scale is None else LayerScale(dim, init=layer_scale)
         self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
         self.mlp = Mlp(dim, int(dim * mlp_ratio), dim)
-        self.ls2 = LayerScale(dim, init=layer_scale)
+        self.ls2 = nn.Identity() if layer_scale is None else LayerScale(dim, init=layer_scale)
 
     def forward(
         self, tokens: Float[Tensor, "batch token dim"], rope: RopeTable | None = None

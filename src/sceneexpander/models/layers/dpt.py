@@ -1,8 +1,4 @@
-"""Dense prediction head: collected tokens of several depths -> one map at image resolution (worldmirror spec 7).
-
-Parameter names follow the released checkpoints: ``norm projects.j resize_layers.j scratch.layer{j+1}_rn scratch.refinenet{k}
-scratch.output_conv1 scratch.output_conv2.{0,2}``.
-"""
+"""Dense prediction head: collected tokens of several depths -> one map at image resolution (worldmirror spec 7, ttt3r spec 6)."""
 
 from __future__ import annotations
 
@@ -31,7 +27,9 @@ class DptConfig:
     ``factors`` is the resolution of each level over the patch grid, finest first: an integer above 1 is a transposed
     convolution, 1 no layer, 0.5 a strided convolution. ``out_channels`` has one width per level. ``rectified_skip``: the skip
     path of the residual units carries relu(x), as in every released VGGT-style head. ``uv_embedding`` adds fixed positions to
-    the maps. ``views_per_chunk`` bounds the memory and changes no number.
+    the maps. ``input_norm`` normalises the tokens. ``crop_doubled`` doubles every fused map and crops it to the next finer
+    level, instead of resizing it to that level: the same unless a side is odd. ``coarse_unit`` gives the coarsest fusion the
+    merging unit that some checkpoints carry and nobody reads. ``views_per_chunk`` bounds the memory and changes no number.
     """
 
     features: int = 256
@@ -40,6 +38,9 @@ class DptConfig:
     factors: tuple[float, ...] = (4, 2, 1, 0.5)
     rectified_skip: bool = True
     uv_embedding: bool = True
+    input_norm: bool = True
+    crop_doubled: bool = False
+    coarse_unit: bool = False
     views_per_chunk: int = 8
 
     def __post_init__(self) -> None:
@@ -51,6 +52,30 @@ class DptConfig:
             )
         if self.views_per_chunk < 1:
             raise ValueError(f"views_per_chunk is {self.views_per_chunk}, must be at least 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DptNames:
+    """Parameter names of the parts; ``{index}`` counts levels from 0, ``{number}`` from 1. Defaults: the VGGT family."""
+
+    project: str = "projects.{index}"
+    resize: str = "resize_layers.{index}"
+    level: str = "scratch.layer{number}_rn"
+    level_alias: str | None = None  # second name of the same parameters
+    fusion: str = "scratch.refinenet{number}"
+    features: str = "scratch.output_conv1"
+    hidden: str = "scratch.output_conv2.0"
+    output: str = "scratch.output_conv2.2"
+
+
+def _add(root: nn.Module, name: str, part: nn.Module) -> None:
+    """Register ``part`` under a dotted name, with plain modules on the way."""
+    *parents, last = name.split(".")
+    for parent in parents:
+        if not hasattr(root, parent):
+            root.add_module(parent, nn.Module())
+        root = root.get_submodule(parent)
+    root.add_module(last, part)
 
 
 @lru_cache(maxsize=128)
@@ -125,31 +150,44 @@ class DptHead(nn.Module):
     """Tokens of several trunk depths -> ``outputs`` raw channels per pixel.
 
     Args:
-        dim: width of the collected tokens.
+        dim: width of the collected tokens; one for each level if they differ (then without ``input_norm``).
         outputs: channels of the map.
         config: sizes.
+        names: parameter names.
     """
 
-    def __init__(self, dim: int, outputs: int, config: DptConfig) -> None:
+    def __init__(
+        self, dim: int | Sequence[int], outputs: int, config: DptConfig, *, names: DptNames | None = None
+    ) -> None:
         super().__init__()
         self.config = config
+        self.names = names = DptNames() if names is None else names
         features, levels = config.features, len(config.factors)
-        self.norm = nn.LayerNorm(dim, eps=1e-5)
-        self.projects = nn.ModuleList([nn.Conv2d(dim, width, 1) for width in config.out_channels])
-        self.resize_layers = nn.ModuleList(
-            [_resize_layer(width, factor) for width, factor in zip(config.out_channels, config.factors, strict=True)]
-        )
-        self.scratch = nn.Module()
-        for j, width in enumerate(config.out_channels, start=1):
-            self.scratch.add_module(f"layer{j}_rn", nn.Conv2d(width, features, 3, padding=1, bias=False))
-            fusion = FusionBlock(features, merges=j < levels, rectified_skip=config.rectified_skip)
-            self.scratch.add_module(f"refinenet{j}", fusion)
-        self.scratch.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
-        self.scratch.output_conv2 = nn.Sequential(
-            nn.Conv2d(features // 2, config.hidden, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(config.hidden, outputs, 1),
-        )
+        dims = (dim,) * levels if isinstance(dim, int) else tuple(dim)
+        if config.input_norm and len(set(dims)) > 1:
+            raise ValueError(f"one normalisation cannot serve tokens of widths {dims}")
+        self.norm = nn.LayerNorm(dims[0], eps=1e-5) if config.input_norm else nn.Identity()
+        for j, (inner, width) in enumerate(zip(dims, config.out_channels, strict=True)):
+            self._add(names.project, nn.Conv2d(inner, width, 1), j)
+        for j, (width, factor) in enumerate(zip(config.out_channels, config.factors, strict=True)):
+            self._add(names.resize, _resize_layer(width, factor), j)
+        for j, width in enumerate(config.out_channels):
+            level = nn.Conv2d(width, features, 3, padding=1, bias=False)
+            self._add(names.level, level, j)
+            if names.level_alias is not None:
+                self._add(names.level_alias, level, j)
+            merges = config.coarse_unit or j < levels - 1
+            self._add(names.fusion, FusionBlock(features, merges=merges, rectified_skip=config.rectified_skip), j)
+        _add(self, names.features, nn.Conv2d(features, features // 2, 3, padding=1))
+        _add(self, names.hidden, nn.Conv2d(features // 2, config.hidden, 3, padding=1))
+        _add(self, names.output, nn.Conv2d(config.hidden, outputs, 1))
+
+    def _add(self, name: str, part: nn.Module, index: int) -> None:
+        _add(self, name.format(index=index, number=index + 1), part)
+
+    def part(self, name: str, index: int) -> nn.Module:
+        """The part of level ``index`` under one of the names of `DptNames`."""
+        return self.get_submodule(name.format(index=index, number=index + 1))
 
     def forward(
         self,
@@ -185,7 +223,8 @@ class DptHead(nn.Module):
         self, features: Float[Tensor, "batch half_features height width"]
     ) -> Float[Tensor, "batch channel height width"]:
         """The last two convolutions, from `features` to the raw channels."""
-        return self.scratch.get_submodule("output_conv2")(features)
+        hidden, output = self.get_submodule(self.names.hidden), self.get_submodule(self.names.output)
+        return output(F.relu(hidden(features)))
 
     def chunks(self, count: int) -> Iterator[slice]:
         """Slices of at most ``views_per_chunk`` views: they bound the memory and change no number."""
@@ -208,26 +247,26 @@ class DptHead(nn.Module):
         maps = []
         for j, tokens in enumerate(levels):
             patches = self.norm(tokens[:, specials:]).transpose(1, 2).unflatten(2, grid)
-            projected = self.projects[j](patches)
+            projected = self.part(self.names.project, j)(patches)
             if self.config.uv_embedding:
                 projected = add_uv_embedding(projected, aspect)
-            resized = self.resize_layers[j](projected)
-            level = self.scratch.get_submodule(f"layer{j + 1}_rn")(resized)
+            resized = self.part(self.names.resize, j)(projected)
+            level = self.part(self.names.level, j)(resized)
             skip = None if skips is None else skips[j]
             maps.append(level if skip is None else level + skip)
-        out = resize_aligned(self.scratch.get_submodule("output_conv1")(self._fuse(maps)), size)
+        out = resize_aligned(self.get_submodule(self.names.features)(self._fuse(maps)), size)
         return add_uv_embedding(out, aspect) if self.config.uv_embedding else out
 
     def _fuse(self, maps: list[Tensor]) -> Tensor:
         """Coarse to fine; the result has twice the resolution of the finest level."""
         running = maps[-1]
-        for j in range(len(maps), 0, -1):
-            level = None if j == len(maps) else maps[j - 1]
-            if j > 1:
-                target = tuple(maps[j - 2].shape[-2:])
-            else:
-                target = (2 * maps[0].shape[-2], 2 * maps[0].shape[-1])
-            running = self.scratch.get_submodule(f"refinenet{j}")(running, level, target)
+        for j in reversed(range(len(maps))):
+            level = None if j == len(maps) - 1 else maps[j]
+            doubled = (2 * maps[j].shape[-2], 2 * maps[j].shape[-1])
+            target = tuple(maps[j - 1].shape[-2:]) if j else doubled
+            resized = doubled if self.config.crop_doubled else target
+            running = self.part(self.names.fusion, j)(running, level, resized)
+            running = running[..., : target[0], : target[1]]
         return running
 
 

@@ -27,11 +27,15 @@ class RopeTable:
         """The table of ``views`` identical token sequences, one after the other."""
         return RopeTable(self.cos.repeat(views, 1, 1), self.sin.repeat(views, 1, 1))
 
+    def first(self, count: int) -> RopeTable:
+        """The table of the first ``count`` tokens."""
+        return RopeTable(self.cos[:count], self.sin[:count])
 
-def grid_positions(rows: int, columns: int, *, specials: int, start: int = 1) -> NDArray[np.int32]:
-    """(row, column) of every token: ``specials`` tokens at (0, 0), then the grid in row-major order from (start, start)."""
-    grid = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1).reshape(-1, 2) + start
-    return np.concatenate([np.zeros((specials, 2), dtype=np.int32), grid.astype(np.int32)])
+
+def grid_positions(rows: int, columns: int, *, specials: int, origin: int = 0) -> NDArray[np.int32]:
+    """(row, column) of every token: ``specials`` tokens at (origin, origin), then the grid, row-major, from origin + 1 on."""
+    grid = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1).reshape(-1, 2) + 1
+    return np.concatenate([np.zeros((specials, 2), dtype=np.int32), grid.astype(np.int32)]) + np.int32(origin)
 
 
 def rope_angles(positions: Int[np.ndarray, "token 2"], head_dim: int, base: float) -> NDArray[np.float32]:
@@ -46,26 +50,30 @@ def rope_angles(positions: Int[np.ndarray, "token 2"], head_dim: int, base: floa
 
 @lru_cache(maxsize=64)
 def _grid_cos_sin(
-    rows: int, columns: int, specials: int, head_dim: int, base: float
+    rows: int, columns: int, specials: int, origin: int, head_dim: int, base: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    angles = rope_angles(grid_positions(rows, columns, specials=specials), head_dim, base)
+    angles = rope_angles(grid_positions(rows, columns, specials=specials, origin=origin), head_dim, base)
     return np.cos(angles), np.sin(angles)
 
 
-def grid_rope(rows: int, columns: int, *, specials: int, head_dim: int, base: float, like: Tensor) -> RopeTable:
-    """Table of one view: special tokens at (0, 0), patches from (1, 1). Device follows ``like``; always float32.
+def grid_rope(
+    rows: int, columns: int, *, specials: int, head_dim: int, base: float, like: Tensor, origin: int = 0
+) -> RopeTable:
+    """Table of one view at the positions of `grid_positions`. Device follows ``like``; always float32.
 
     The numbers are cached as numpy arrays, not tensors: tensors made in inference mode or under a fake-tensor mode must not
     leak into a later training step.
     """
-    cos, sin = _grid_cos_sin(rows, columns, specials, head_dim, base)
+    cos, sin = _grid_cos_sin(rows, columns, specials, origin, head_dim, base)
     return RopeTable(torch.tensor(cos, device=like.device), torch.tensor(sin, device=like.device))
 
 
 def apply_rope(
-    heads: Float[Tensor, "batch token head width"], table: RopeTable
+    heads: Float[Tensor, "batch token head width"], table: RopeTable, *, half: bool = False
 ) -> Float[Tensor, "batch token head width"]:
-    """Rotate queries or keys; the dtype is kept."""
+    """Rotate queries or keys; the dtype is kept. ``half`` rounds what goes in and what comes out to float16."""
+    if half:
+        return apply_rope(heads.half().float(), table).half().to(heads.dtype)
     halves = torch.unflatten(heads, -1, (2, 2, heads.shape[-1] // 4))
     first, second = halves[..., 0, :], halves[..., 1, :]
     cos = table.cos[:, None].to(heads.dtype)
