@@ -32,7 +32,7 @@ def draw_mode(config: AugmentConfig, generator: torch.Generator) -> Mode:
     return (Mode.IDENTITY, Mode.GLOBAL, Mode.BLOCK, Mode.GLOBAL_AND_BLOCK)[place]
 
 
-def _uniform(count: int, limit: float, generator: torch.Generator) -> Float[Tensor, count]:
+def _uniform(count: int, limit: float, generator: torch.Generator) -> Float[Tensor, "count"]:
     return (torch.rand(count, generator=generator) * 2 - 1) * limit
 
 
@@ -63,7 +63,7 @@ def identity_grid(height: int, width: int) -> Float[Tensor, "height width 2"]:
 
 
 def _apply_affine(
-    affine: Float[Tensor, "2 3"], grid: Float[Tensor, "height width 2"], centre: Float[Tensor, 2], aspect: float
+    affine: Float[Tensor, "2 3"], grid: Float[Tensor, "height width 2"], centre: Float[Tensor, "2"], aspect: float
 ) -> Float[Tensor, "height width 2"]:
     """Move grid points by an affine map about ``centre`` (normalised); the map acts in isotropic units."""
     unit = torch.tensor([aspect, 1.0])

@@ -54,7 +54,7 @@ class LossTerms:
 
 def camera_distance(
     predicted: Float[Tensor, "view 9"], target: Float[Tensor, "view 9"], huber: float
-) -> Float[Tensor, view]:
+) -> Float[Tensor, "view"]:
     """d_cam: mean smooth-L1 over the 9 entries, the target's quaternion given the sign that is nearer to the prediction.
 
     q and -q are the same rotation; without the alignment equal cameras could have a large distance.
@@ -69,7 +69,7 @@ def depth_distance(
     predicted: Float[Tensor, "view height width"],
     target: Float[Tensor, "view height width"],
     kind: DepthDistance,
-) -> Float[Tensor, view]:
+) -> Float[Tensor, "view"]:
     """d_D: mean absolute difference, in scene units; or the scale-invariant log error (standard deviation of the log ratio)."""
     if kind is DepthDistance.L1:
         return (predicted - target).abs().mean((-2, -1))
@@ -81,7 +81,7 @@ def depth_distance(
 
 def normal_distance(
     predicted: Float[Tensor, "view height width 3"], target: Float[Tensor, "view height width 3"]
-) -> Float[Tensor, view]:
+) -> Float[Tensor, "view"]:
     """d_N: mean of 1 - cosine. Inputs are unit vectors."""
     return (1 - (predicted * target).sum(-1)).mean((-2, -1))
 

@@ -27,8 +27,8 @@ class Reconstruction:
     model: str
     weights_sha256: str
     view_ids: tuple[str, ...]
-    generated: Bool[Tensor, view]
-    posed: Bool[Tensor, view]
+    generated: Bool[Tensor, "view"]
+    posed: Bool[Tensor, "view"]
     camera_vector: Float[Tensor, "view 9"]
     world_from_cam: Float[Tensor, "view 4 4"]
     intrinsics_px: Float[Tensor, "view 3 3"]

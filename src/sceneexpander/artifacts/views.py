@@ -80,7 +80,7 @@ class ViewSet:
         return tuple(record.view_id for record in self.records)
 
     @property
-    def generated(self) -> Bool[Tensor, view]:
+    def generated(self) -> Bool[Tensor, "view"]:
         """Which views were generated."""
         return torch.tensor([record.generated for record in self.records], dtype=torch.bool)
 

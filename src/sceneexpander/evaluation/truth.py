@@ -205,7 +205,7 @@ def _pair_errors(
     return _mean(rotations), _mean(directions)
 
 
-def _angle_deg(estimated: Float[Tensor, 3], true: Float[Tensor, 3]) -> float:
+def _angle_deg(estimated: Float[Tensor, "3"], true: Float[Tensor, "3"]) -> float:
     if float(estimated.norm()) == 0:
         return 90.0
     cross = torch.linalg.cross(estimated, true).norm()

@@ -44,7 +44,7 @@ def navigation_coverage(
     height: int,
     width: int,
     config: EvaluateConfig,
-) -> Float[Tensor, frame]:
+) -> Float[Tensor, "frame"]:
     """Share of pixels with alpha above the threshold, for each frame of a navigation in the reconstruction's own frame.
 
     Coverage gained by an expansion is the difference of the means after and before, on the same frames: see `same_place`.

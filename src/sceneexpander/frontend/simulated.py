@@ -92,11 +92,11 @@ def _gradient(images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "vi
 
 def _seen(
     xy: Float[Tensor, "point 2"],
-    z: Float[Tensor, point],
+    z: Float[Tensor, "point"],
     depth: Float[Tensor, "height width"],
     valid: Bool[Tensor, "height width"],
     tolerance: float,
-) -> Int[Tensor, seen]:
+) -> Int[Tensor, "seen"]:
     """Indices of the points that are in the frame and not behind the visible surface."""
     height, width = depth.shape
     column, row = xy[:, 0].floor().long(), xy[:, 1].floor().long()

@@ -21,8 +21,8 @@ class SparsePoints:
     """
 
     points_world: Float[Tensor, "point 3"]
-    view_index: Int[Tensor, observation]
-    point_index: Int[Tensor, observation]
+    view_index: Int[Tensor, "observation"]
+    point_index: Int[Tensor, "observation"]
     pixel_xy: Float[Tensor, "observation 2"]
 
     def __post_init__(self) -> None:

@@ -19,7 +19,7 @@ class Similarity:
 
     scale: float
     rotation: Float[Tensor, "3 3"]
-    translation: Float[Tensor, 3]
+    translation: Float[Tensor, "3"]
 
     def points(self, points_source: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Points of the source frame in the target frame."""

@@ -28,7 +28,7 @@ def camera_map(reconstruction: Reconstruction) -> str:
     scale = (_SIDE - 2 * _MARGIN) / max(float((high - low).max()), 1e-9)
     middle = (low + high) / 2
 
-    def place(point: Float[Tensor, 2]) -> tuple[float, float]:
+    def place(point: Float[Tensor, "2"]) -> tuple[float, float]:
         offset = (point - middle) * scale
         return _SIDE / 2 + float(offset[0]), _SIDE / 2 - float(offset[1])
 
@@ -48,7 +48,7 @@ def camera_map(reconstruction: Reconstruction) -> str:
 
 def _extent(
     points: Float[Tensor, "point 2"], centres: Float[Tensor, "view 2"]
-) -> tuple[Float[Tensor, 2], Float[Tensor, 2]]:
+) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
     """Box around the cameras and the bulk of the points: a few far ones must not shrink the rest to a dot."""
     if len(points) == 0:
         return centres.min(0).values - 0.5, centres.max(0).values + 0.5

@@ -13,7 +13,7 @@ VOXEL_LIMIT = 2**40  # voxel indices are clamped to this, so that a wild depth c
 KEY_LIMIT = 2**62
 
 
-def voxel_groups(means: Float[Tensor, "gaussian 3"], voxel_size: float) -> tuple[Int[Tensor, gaussian], int]:
+def voxel_groups(means: Float[Tensor, "gaussian 3"], voxel_size: float) -> tuple[Int[Tensor, "gaussian"], int]:
     """(group of every Gaussian, number of groups); groups are numbered in ascending (x, y, z) voxel order."""
     index = torch.nan_to_num(torch.floor(means.detach() / voxel_size), nan=0.0)
     voxel = index.clamp(-VOXEL_LIMIT, VOXEL_LIMIT).to(torch.int64)
@@ -32,8 +32,8 @@ def merge_voxels(
     batch_index: int,
     *,
     voxel_size: float,
-    source_view: Int[Tensor, gaussian],
-    generated: Bool[Tensor, gaussian],
+    source_view: Int[Tensor, "gaussian"],
+    generated: Bool[Tensor, "gaussian"],
 ) -> Gaussians:
     """Weighted means of the Gaussians of one scene that fall in the same voxel, in ascending voxel order.
 
@@ -70,8 +70,8 @@ def merge_voxels(
 
 
 def _provenance(
-    group: Int[Tensor, gaussian], count: int, weights: Float[Tensor, gaussian], generated: Bool[Tensor, gaussian]
-) -> tuple[Int[Tensor, group], Bool[Tensor, group]]:
+    group: Int[Tensor, "gaussian"], count: int, weights: Float[Tensor, "gaussian"], generated: Bool[Tensor, "gaussian"]
+) -> tuple[Int[Tensor, "group"], Bool[Tensor, "group"]]:
     """(index of each group's heaviest member, whether generated members hold more than half of its weight)."""
     top = weights.new_zeros(count).scatter_reduce(0, group, weights, "amax", include_self=False)
     member = torch.arange(group.shape[0], device=group.device)
@@ -85,8 +85,8 @@ def unmerged(
     pixels: PixelGaussians,
     batch_index: int,
     *,
-    source_view: Int[Tensor, gaussian],
-    generated: Bool[Tensor, gaussian],
+    source_view: Int[Tensor, "gaussian"],
+    generated: Bool[Tensor, "gaussian"],
 ) -> Gaussians:
     """The Gaussians of one scene as they are, with their predicted opacities."""
     return Gaussians(

@@ -70,7 +70,7 @@ def pose_vector(
     return torch.cat([torch.stack(scaled), quat_xyzw_from_matrix(pose[..., :3, :3])], dim=-1)
 
 
-def _camera_extent(cameras: Float[Tensor, "view 3"]) -> tuple[Float[Tensor, 3], Float[Tensor, 3]]:
+def _camera_extent(cameras: Float[Tensor, "view 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     if cameras.shape[0] <= MANY_VIEWS:
         return cameras.amin(0), cameras.amax(0)
     return torch.quantile(cameras, 0.05, dim=0), torch.quantile(cameras, 0.95, dim=0)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.geometry.rigid import rigid_inverse
-from sceneexpander.models.layers.quaternion import quat_xyzw_from_matrix
+from sceneexpander.models.layers.quaternion import raw_camera_vector
 from sceneexpander.models.worldmirror.gaussians import unproject_integer_pixels
 
 CLAMP = 100.0
@@ -66,11 +66,7 @@ def camera_vector_truth(
     width: int,
 ) -> Float[Tensor, "batch view 9"]:
     """Ground truth of `camera_loss`: ``[cam_from_world t, quat xyzw with w >= 0, vertical fov, horizontal fov]``."""
-    cam_from_world = rigid_inverse(world_from_cam)
-    fov_v = 2 * torch.atan((height / 2) / intrinsics_px[..., 1, 1])
-    fov_u = 2 * torch.atan((width / 2) / intrinsics_px[..., 0, 0])
-    quaternion = quat_xyzw_from_matrix(cam_from_world[..., :3, :3])
-    return torch.cat([cam_from_world[..., :3, 3], quaternion, fov_v[..., None], fov_u[..., None]], dim=-1)
+    return raw_camera_vector(rigid_inverse(world_from_cam), intrinsics_px, height, width)
 
 
 def point_loss(points: VectorMap, truth: VectorMap, mask: Mask, conf: Map) -> RegressionTerms:
@@ -101,7 +97,7 @@ def regression_loss(
     return RegressionTerms(conf=weighted, reg=filtered_mean(residual), spatial=spatial(prediction, truth, mask))
 
 
-def filtered_mean(values: Float[Tensor, value]) -> Float[Tensor, ""]:
+def filtered_mean(values: Float[Tensor, "value"]) -> Float[Tensor, ""]:
     """Mean of the values below their 98 % quantile, if there are more than 1000 of them."""
     if values.numel() > MANY:
         values = values.clamp(max=CLAMP)
