@@ -59,7 +59,7 @@ ablate: .venv/.stamp ## The rows of the paper's ablation table, as one sweep
 	$(PY) -m sceneexpander.sweep --multirun ablation=baseline,anchor,subset_aug,self_distill,self_distill_p1,full
 
 mini-scores: .venv/.stamp ## Errors of the embedded reconstructor on made scenes
-	$(PY) benchmarks/mini_scores.py
+	$(PY) scripts/mini_scores.py
 
 clean: ## Remove outputs and caches of tools (keeps .venv, the pipeline's cache, mlflow and runs)
 	rm -rf outputs .pytest_cache .mypy_cache .ruff_cache .hypothesis build

@@ -20,7 +20,7 @@ from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.report.camera_map import camera_map
 
 FACTS = "page.json"
-_PICTURE_SIDE_PX = 480
+_PICTURE_SIDE_PX = 720
 _LOSSES = ("loss", "anchor_camera", "anchor_depth", "anchor_normal", "gen_camera", "gen_depth", "gen_normal", "drift")
 
 
@@ -79,7 +79,7 @@ def collect_scene(source: SceneSource, folder: Path) -> None:
 
 def _captured(views: ViewSet, folder: Path) -> list[dict[str, Any]]:
     entries = []
-    for record, image in zip(views.records, views.images, strict=True):
+    for record, image in zip(views.records, views.detail_images, strict=True):
         picture = f"captured/{record.view_id}.jpg"
         _save_picture(folder / picture, image)
         entries.append(
@@ -98,7 +98,7 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
     inserted = InsertedView.load(source.inserted)
     chosen = inserted.provenance[inserted.chosen]
     base = f"round_{source.number}"
-    _save_picture(folder / base / "inserted.jpg", inserted.view.images[0])
+    _save_picture(folder / base / "inserted.jpg", inserted.view.detail_images[0])
     sheet = source.inserted / "sheet.png"
     if sheet.is_file():
         shutil.copyfile(sheet, folder / base / "sheet.png")

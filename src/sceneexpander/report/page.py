@@ -89,17 +89,18 @@ def _table_row(method: Mapping[str, Any], rows: Mapping[str, MetricsRow], column
     cells = []
     for column in columns:
         value = rows[method["name"]].value(column.name)
-        # The ceiling of preservation is not a competitor: bold compares the methods that show the new view.
-        rivals = [row.value(column.name) for name, row in rows.items() if name != "captured"]
-        known = [other for other in rivals if other is not None]
-        best = (max if column.better == "higher" else min)(known) if known and len(known) > 1 else None
-        cells.append(
-            {
-                "text": _number(value, column),
-                "best": method["name"] != "captured" and value is not None and value == best,
-            }
-        )
+        # The ceiling of preservation is not a competitor: bold compares the methods that show the new view, as far as the printed
+        # digits go.
+        rivals = {name: round(v, column.digits + 2 * column.percent) for name, v in _known(rows, column).items()}
+        best = (max if column.better == "higher" else min)(rivals.values(), default=None)
+        wins = len(set(rivals.values())) > 1 and rivals.get(method["name"]) == best
+        cells.append({"text": _number(value, column), "best": wins})
     return {"name": method["name"], "label": words.label, "meaning": words.meaning, "cells": cells}
+
+
+def _known(rows: Mapping[str, MetricsRow], column: Column) -> dict[str, float]:
+    values = {name: row.value(column.name) for name, row in rows.items() if name != "captured"}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _number(value: float | None, column: Column) -> str:

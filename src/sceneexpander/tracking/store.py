@@ -104,11 +104,12 @@ def _complete_local(root: Path, config: TrackingConfig) -> dict[str, str]:
 
 def _open(config: TrackingConfig, root: Path) -> tuple[Any, str]:
     quiet_environment()
-    for name in ("alembic", "mlflow"):
-        logging.getLogger(name).setLevel(logging.WARNING)
     from mlflow.exceptions import MlflowException
     from mlflow.tracking import MlflowClient
 
+    # After the import, which sets its own levels: making the tables is not worth twenty lines.
+    for name in ("alembic", "mlflow"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     local = config.uri == "local"
     try:
         client = MlflowClient(tracking_uri=tracking_uri(config, root))
