@@ -15,7 +15,11 @@ from sceneexpander.errors import UserError
 from sceneexpander.geometry.checks import OutputCheck
 
 # Modules with `CASES` (a list of CaseRunner) and `KEYS` (a list of KeyFamily); imported when the command runs.
-FAMILIES = ("sceneexpander.conformance.worldmirror", "sceneexpander.conformance.gaussians")
+FAMILIES = (
+    "sceneexpander.conformance.worldmirror",
+    "sceneexpander.conformance.omnivggt",
+    "sceneexpander.conformance.gaussians",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.geometry.checks import OutputCheck, compare_tensors
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.models.layers.dpt import DptConfig
+from sceneexpander.models.preprocess import load_images
 from sceneexpander.models.protocol import Head
 from sceneexpander.models.weights import load_weights, read_tensors
 from sceneexpander.models.worldmirror.config import GaussianConfig, WorldMirrorConfig
@@ -22,7 +23,6 @@ from sceneexpander.models.worldmirror.gaussians import PixelGaussians
 from sceneexpander.models.worldmirror.merge import merge_voxels
 from sceneexpander.models.worldmirror.model import BatchPrediction, GaussianOutput, WorldMirror
 from sceneexpander.models.worldmirror.novel_view import predict_novel_views
-from sceneexpander.models.worldmirror.preprocess import load_images
 from sceneexpander.models.worldmirror.priors import BatchPriors
 
 ATOL, RTOL = 2e-5, 2e-4  # recommended by the fixtures; float32 noise is at most 0.14 of it

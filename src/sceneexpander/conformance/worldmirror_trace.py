@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import TracebackType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.utils.hooks import RemovableHandle
 
+from sceneexpander.conformance.recorder import Recorder
 from sceneexpander.models.layers.rope import grid_positions
 from sceneexpander.models.worldmirror.model import WorldMirror
 from sceneexpander.models.worldmirror.priors import normalised_depth, pose_vector, ray_vector
 
-Hook = Callable[[nn.Module, tuple[Any, ...], Any], None]
 
-
-class Trace:
+class Trace(Recorder):
     """Records during ``with trace: model(...)``; of several trunk passes the first is kept, of Gaussian heads the only one.
 
     Args:
@@ -25,42 +21,33 @@ class Trace:
     """
 
     def __init__(self, model: WorldMirror) -> None:
+        super().__init__()
         self.model = model
-        self.records: dict[str, Tensor] = {}
-        self.handles: list[RemovableHandle] = []
 
-    def __enter__(self) -> Trace:
+    def observe(self) -> None:
         model, trunk = self.model, self.model.visual_geometry_transformer
         encoder = trunk.patch_embed
-        self._output(encoder.patch_embed, "dino.patch_proj")
-        self._input(encoder.blocks[0], "dino.tokens_in")
+        self.output(encoder.patch_embed, "dino.patch_proj")
+        self.input(encoder.blocks[0], "dino.tokens_in")
         for k, block in enumerate(encoder.blocks):
-            self._output(block, f"dino.block{k}")
-        self._output(encoder, "patch_tokens")
-        self._input(trunk.frame_blocks[0], "trunk.tokens_in")
+            self.output(block, f"dino.block{k}")
+        self.output(encoder, "patch_tokens")
+        self.input(trunk.frame_blocks[0], "trunk.tokens_in")
         for k, (frame, every) in enumerate(zip(trunk.frame_blocks, trunk.global_blocks, strict=True)):
-            self._output(frame, f"trunk.frame{k}")
-            self._output(every, f"trunk.global{k}")
-        self._hook(trunk, self._collected)
-        self._hook(model.cam_head, self._camera_steps)
+            self.output(frame, f"trunk.frame{k}")
+            self.output(every, f"trunk.global{k}")
+        self.hook(trunk, self._collected)
+        self.hook(model.cam_head, self._camera_steps)
         if model.config.prior_prompting:
-            self._output(trunk.pose_embed, "cond.pose_token")
-            self._output(trunk.ray_embed, "cond.ray_token")
-            self._output(trunk.depth_embed, "cond.depth_tokens")
+            self.output(trunk.pose_embed, "cond.pose_token")
+            self.output(trunk.ray_embed, "cond.ray_token")
+            self.output(trunk.depth_embed, "cond.depth_tokens")
         for name in ("depth_head", "pts_head", "norm_head", "gs_head"):
             if hasattr(model, name):
                 self._dense_head(name)
         if hasattr(model, "gs_renderer"):
-            self._input(model.gs_renderer, "gs_head.features")
-            self._output(model.gs_renderer, "gs.params_raw")
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        for handle in self.handles:
-            handle.remove()
-        self.handles.clear()
+            self.input(model.gs_renderer, "gs_head.features")
+            self.output(model.gs_renderer, "gs.params_raw")
 
     def tensors(self, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
         """The records as ``inter.*``, reshaped to the recorded layout, with what follows from the inputs alone."""
@@ -100,29 +87,17 @@ class Trace:
             return value.reshape(value.shape[0], views, -1, value.shape[-1])
         return value.reshape(value.shape[0], views, *value.shape[1:])
 
-    def _record(self, name: str, value: Tensor) -> None:
-        self.records.setdefault(name, value.detach().clone())
-
-    def _hook(self, module: nn.Module, hook: Hook) -> None:
-        self.handles.append(module.register_forward_hook(hook))
-
-    def _output(self, module: nn.Module, name: str) -> None:
-        self._hook(module, lambda _module, _inputs, output: self._record(name, output))
-
-    def _input(self, module: nn.Module, name: str) -> None:
-        self._hook(module, lambda _module, inputs, _output: self._record(name, inputs[0]))
-
     def _collected(self, _module: nn.Module, _inputs: tuple[Any, ...], output: Any) -> None:
         for j, tokens in enumerate(output.collected):
-            self._record(f"tokens.collected{j}", tokens)
+            self.record(f"tokens.collected{j}", tokens)
 
     def _camera_steps(self, _module: nn.Module, _inputs: tuple[Any, ...], output: Any) -> None:
         for k, vector in enumerate(output):
-            self._record(f"cam_head.iter{k}", vector)
+            self.record(f"cam_head.iter{k}", vector)
 
     def _dense_head(self, name: str) -> None:
         head = self.model.get_submodule(name)
         for j, layer in enumerate(head.get_submodule("resize_layers").children()):
-            self._output(layer, f"{name}.level{j}")
-        self._output(head.get_submodule("scratch.output_conv1"), f"{name}.fused8x")
-        self._output(head.get_submodule("scratch.output_conv2.2"), f"{name}.logits")
+            self.output(layer, f"{name}.level{j}")
+        self.output(head.get_submodule("scratch.output_conv1"), f"{name}.fused8x")
+        self.output(head.get_submodule("scratch.output_conv2.2"), f"{name}.logits")

@@ -10,7 +10,7 @@ import torch
 
 from sceneexpander.errors import UserError
 from sceneexpander.models.protocol import Reconstructor
-from sceneexpander.models.weights import ResolvedWeights, load_weights, resolve_weights
+from sceneexpander.models.weights import HUB_FILE, ResolvedWeights, load_weights, resolve_weights
 
 DEFAULT_VARIANT = "default"
 
@@ -46,11 +46,39 @@ def _worldmirror(variant: str, weights: ResolvedWeights) -> Reconstructor:
     return model
 
 
-_BUILDERS: dict[str, tuple[Callable[[str, ResolvedWeights], Reconstructor], str]] = {
-    "mini": (_mini, "Apache-2.0, made by this project"),
-    "worldmirror": (
-        _worldmirror,
-        "Tencent HunyuanWorld-Mirror community licence: not valid in the EU, the UK and South Korea; adapted weights are derivatives",
+def _omnivggt(variant: str, weights: ResolvedWeights) -> Reconstructor:
+    from sceneexpander.models.omnivggt import OmniVGGT, OmniVGGTConfig
+
+    configs = {
+        DEFAULT_VARIANT: OmniVGGTConfig.large,
+        "large": OmniVGGTConfig.large,
+        "tiny": OmniVGGTConfig.tiny,
+    }
+    _check_variant("omnivggt", variant, tuple(configs))
+    with torch.device("meta"):
+        model = OmniVGGT(configs[variant]())
+    load_weights(model, weights.path)
+    return model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Family:
+    build: Callable[[str, ResolvedWeights], Reconstructor]
+    licence: str
+    hub_file: str = HUB_FILE  # name of the weights in the authors' repository
+
+
+_BUILDERS = {
+    "mini": _Family(build=_mini, licence="Apache-2.0, made by this project"),
+    "worldmirror": _Family(
+        build=_worldmirror,
+        licence="Tencent HunyuanWorld-Mirror community licence: not valid in the EU, the UK and South Korea; adapted weights are "
+        "derivatives",
+    ),
+    "omnivggt": _Family(
+        build=_omnivggt,
+        licence="code MIT; the terms of the released weights (Livioni/OmniVGGT) are those of their own page, read them there",
+        hub_file="OmniVGGT.safetensors",
     ),
 }
 
@@ -78,10 +106,10 @@ def build_reconstructor(
         raise UserError(
             f"unknown reconstructor {name!r}", where="model.name", fix=_did_you_mean(name, tuple(_BUILDERS))
         )
-    builder, licence = _BUILDERS[name]
-    resolved = resolve_weights(weights, model=name, allow_download=allow_download)
-    model = builder(variant, resolved)
-    return BuiltReconstructor(model=model, weights=resolved, licence=licence)
+    family = _BUILDERS[name]
+    resolved = resolve_weights(weights, model=name, hub_file=family.hub_file, allow_download=allow_download)
+    model = family.build(variant, resolved)
+    return BuiltReconstructor(model=model, weights=resolved, licence=family.licence)
 
 
 def _check_variant(model: str, variant: str, known: tuple[str, ...]) -> None:

@@ -6,6 +6,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sceneexpander.geometry.camera import fov_rad_from_intrinsics
+
+
+def raw_camera_vector(
+    cam_from_world: Float[Tensor, "*batch 4 4"], intrinsics_px: Float[Tensor, "*batch 3 3"], height: int, width: int
+) -> Float[Tensor, "*batch 9"]:
+    """``[t, quat xyzw with w >= 0, vertical fov, horizontal fov]`` as the networks read it: quaternion not normalised."""
+    fov_x, fov_y = fov_rad_from_intrinsics(intrinsics_px, height, width)
+    quaternion = quat_xyzw_from_matrix(cam_from_world[..., :3, :3])
+    return torch.cat([cam_from_world[..., :3, 3], quaternion, fov_y[..., None], fov_x[..., None]], dim=-1)
+
 
 def quat_xyzw_from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Scalar-last quaternion with w >= 0, **not** normalised: for a matrix that is not quite a rotation its length differs from 1.

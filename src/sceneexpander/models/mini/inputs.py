@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.normals import normals_from_depth, viewing_rays
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.geometry.rigid import rigid_inverse, transform_points
 from sceneexpander.models.mini.config import OUTPUT_STRIDE, PATCH_PX, MiniConfig
-from sceneexpander.models.mini.normals import normals_from_depth, viewing_rays
 
 FINE_CHANNELS = 5  # RGB, log base depth, confident
 CROSS_VIEW_CHANNELS = 6  # see `compare_views`
@@ -36,7 +36,7 @@ class RequiredPriors:
     intrinsics_px: Float[Tensor, "view 3 3"]
     depth: Float[Tensor, "view height width"]  # > 0 everywhere
     evidence: Float[Tensor, "view channel height width"]
-    posed: Bool[Tensor, " view"]
+    posed: Bool[Tensor, "view"]
     scale: float  # median base depth of the scene
 
     @property
@@ -137,7 +137,7 @@ def compare_views(
     confident: Float[Tensor, "view height width"],
     world_from_cam: Float[Tensor, "view 4 4"],
     intrinsics_px: Float[Tensor, "view 3 3"],
-    posed: Bool[Tensor, " view"],
+    posed: Bool[Tensor, "view"],
     *,
     most_views: int,
 ) -> Float[Tensor, "view 6 height width"]:

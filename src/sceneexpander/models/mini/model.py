@@ -15,11 +15,11 @@ from torch.nn import functional
 
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import camera_vector_from_pose, pose_from_camera_vector, unproject_to_world
+from sceneexpander.geometry.normals import face_camera, viewing_rays
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.mini.config import MiniConfig
 from sceneexpander.models.mini.inputs import RequiredPriors, require_priors, working_views
 from sceneexpander.models.mini.network import MiniNetwork
-from sceneexpander.models.mini.normals import face_camera, viewing_rays
 from sceneexpander.models.mini.splats import covered_by_others, pixel_aligned_gaussians
 from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction
 from sceneexpander.models.weights import load_weights, resolve_weights

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from sceneexpander.models.layers.backbone import BackboneConfig
 from sceneexpander.models.layers.dpt import DptConfig
 from sceneexpander.models.protocol import ALL_HEADS, Head
 
@@ -28,38 +29,22 @@ class GaussianConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WorldMirrorConfig:
+class WorldMirrorConfig(BackboneConfig):
     """Sizes and switches. The defaults are those of the released checkpoint (worldmirror spec 1.1).
 
-    ``image_size`` is the side of the square that the position table was made for; images may have any size that is a multiple of
-    ``patch``. ``prior_prompting`` adds a pose and a ray token to every view. ``heads`` are the heads that exist.
+    ``prior_prompting`` adds a pose and a ray token to every view. ``heads`` are the heads that exist.
     """
 
-    image_size: int = 518
-    patch: int = 14
-    dim: int = 1024
-    encoder_depth: int = 24
-    encoder_heads: int = 16
-    trunk_depth: int = 24
-    trunk_heads: int = 16
-    registers: int = 4
-    rope_base: float = 100.0
-    collect: tuple[int, ...] = (4, 11, 17, 23)
     prior_prompting: bool = True
-    camera_depth: int = 4
-    camera_heads: int = 16
-    camera_steps: int = 4
-    dpt: DptConfig = field(default_factory=DptConfig)
     gaussian_dpt: DptConfig = field(default_factory=DptConfig)
     gaussian: GaussianConfig = field(default_factory=GaussianConfig)
     heads: frozenset[Head] = ALL_HEADS
 
     def __post_init__(self) -> None:
-        levels = {len(self.collect), len(self.dpt.factors), len(self.gaussian_dpt.factors)}
-        if len(levels) != 1:
-            raise ValueError(f"{len(self.collect)} collected blocks do not match the dense heads' levels")
-        if self.image_size % self.patch:
-            raise ValueError(f"image_size {self.image_size} is not a multiple of the patch side {self.patch}")
+        # Not super(): a class with slots is made twice, and super() would mean the first one.
+        BackboneConfig.__post_init__(self)
+        if len(self.collect) != len(self.gaussian_dpt.factors):
+            raise ValueError(f"{len(self.collect)} collected blocks do not match the Gaussian head's levels")
         if Head.CAMERA not in self.heads:
             raise ValueError("the camera head cannot be left out: predictions are made of cameras")
 
@@ -71,20 +56,8 @@ class WorldMirrorConfig:
     @classmethod
     def tiny(cls) -> WorldMirrorConfig:
         """A complete but very small configuration (0.6 M parameters) for dry runs; nobody publishes weights for it."""
-        dpt = DptConfig(features=16, out_channels=(8, 12, 16, 20))
-        return cls(
-            image_size=56,
-            dim=32,
-            encoder_depth=2,
-            encoder_heads=4,
-            trunk_depth=4,
-            trunk_heads=2,
-            collect=(0, 1, 2, 3),
-            camera_depth=2,
-            camera_heads=4,
-            dpt=dpt,
-            gaussian_dpt=dpt,
-        )
+        sizes = cls.tiny_sizes()
+        return replace(sizes, gaussian_dpt=sizes.dpt)
 
     @property
     def specials(self) -> int:

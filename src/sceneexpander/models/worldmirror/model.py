@@ -8,13 +8,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from sceneexpander.geometry.camera import pose_from_camera_vector
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.priors import Priors
-from sceneexpander.models.layers.activations import confidence, positive_exp, signed_expm1, unit_vector
+from sceneexpander.models.layers.activations import confidence, unit_vector
+from sceneexpander.models.layers.backbone import TrunkFeatures
 from sceneexpander.models.layers.camera_head import CameraHead
 from sceneexpander.models.layers.dpt import DptHead
 from sceneexpander.models.layers.init import materialise
+from sceneexpander.models.layers.outputs import (
+    Cameras,
+    Map,
+    VectorMap,
+    cameras_from_vector,
+    channels_last,
+    check_views,
+    dense_map,
+    depth_and_conf,
+    points_and_conf,
+)
 from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction
 from sceneexpander.models.worldmirror.config import WorldMirrorConfig
 from sceneexpander.models.worldmirror.gaussians import (
@@ -28,19 +39,7 @@ from sceneexpander.models.worldmirror.gaussians import (
 from sceneexpander.models.worldmirror.init import initialise
 from sceneexpander.models.worldmirror.merge import merge_voxels, unmerged
 from sceneexpander.models.worldmirror.priors import BatchPriors, NormalisedPriors, normalise_priors
-from sceneexpander.models.worldmirror.transformer import TrunkFeatures, VisualGeometryTransformer
-
-Map = Float[Tensor, "batch view height width"]
-VectorMap = Float[Tensor, "batch view height width 3"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cameras:
-    """Cameras of B scenes of S views."""
-
-    vector: Float[Tensor, "batch view 9"]  # as in `Prediction.camera_vector`
-    world_from_cam: Float[Tensor, "batch view 4 4"]
-    intrinsics_px: Float[Tensor, "batch view 3 3"]
+from sceneexpander.models.worldmirror.transformer import VisualGeometryTransformer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,11 +116,10 @@ class WorldMirror(nn.Module):
         priors: Priors | None = None,
         *,
         heads: frozenset[Head] = ALL_HEADS,
-        generated: Bool[Tensor, view] | None = None,
+        generated: Bool[Tensor, "view"] | None = None,
     ) -> Prediction:
         """See `Reconstructor.predict`. The camera head always runs; `Priors.evidence` is not read."""
-        if images.ndim != 4 or images.shape[1] != 3:
-            raise ValueError(f"images must be (view, 3, height, width), got {tuple(images.shape)}")
+        check_views(images)
         batch_generated = None if generated is None else generated[None]
         batch = self(images[None], batch_priors(priors), heads=heads, generated=batch_generated)
         return _first_scene(batch)
@@ -160,9 +158,6 @@ class WorldMirror(nn.Module):
         self, images: Float[Tensor, "batch view 3 height width"], priors: NormalisedPriors | None = None
     ) -> TrunkFeatures:
         """The trunk alone."""
-        height, width = images.shape[-2:]
-        if height % self.size_multiple or width % self.size_multiple or not height * width:
-            raise ValueError(f"image size {height} x {width} is not a multiple of {self.size_multiple}")
         return self.visual_geometry_transformer(images, priors, checkpoint=self.checkpoint_activations)
 
     def decode(
@@ -179,13 +174,13 @@ class WorldMirror(nn.Module):
         depth = depth_conf = points = points_conf = normals = normals_conf = gaussians = None
         if Head.DEPTH in wanted:
             raw = self._dense(self.depth_head, features)
-            depth, depth_conf = positive_exp(raw[:, :, 0]), confidence(raw[:, :, 1])
+            depth, depth_conf = depth_and_conf(raw)
         if Head.POINTS in wanted:
             raw = self._dense(self.pts_head, features)
-            points, points_conf = signed_expm1(_channels_last(raw[:, :, :3])), confidence(raw[:, :, 3])
+            points, points_conf = points_and_conf(raw)
         if Head.NORMALS in wanted:
             raw = self._dense(self.norm_head, features)
-            normals, normals_conf = unit_vector(_channels_last(raw[:, :, :3])), confidence(raw[:, :, 3])
+            normals, normals_conf = unit_vector(channels_last(raw[:, :, :3])), confidence(raw[:, :, 3])
         if Head.GAUSSIANS in wanted:
             gaussians = self.gaussians(features, images, cameras, generated)
         return BatchPrediction(
@@ -202,8 +197,7 @@ class WorldMirror(nn.Module):
     def cameras(self, features: TrunkFeatures) -> Cameras:
         """Cameras of all views (worldmirror spec 6)."""
         vector = self.cam_head(features.camera_tokens, checkpoint=self.checkpoint_activations)[-1]
-        world_from_cam, intrinsics = pose_from_camera_vector(vector, *features.size)
-        return Cameras(vector=vector, world_from_cam=world_from_cam, intrinsics_px=intrinsics)
+        return cameras_from_vector(vector, features.size)
 
     def gaussians(
         self,
@@ -224,7 +218,7 @@ class WorldMirror(nn.Module):
             checkpoint=self.checkpoint_activations,
         )
         depth_raw = torch.unflatten(depth_raw, 0, (batch, views))
-        depth, conf = positive_exp(depth_raw[:, :, 0]), confidence(depth_raw[:, :, 1])
+        depth, conf = depth_and_conf(depth_raw)
         means = unproject_integer_pixels(depth, cameras.intrinsics_px.detach(), cameras.world_from_cam.detach())
         pixels = activate_gaussians(torch.unflatten(channels, 0, (batch, views)), images, means, config)
         source = torch.arange(views, device=images.device).repeat_interleave(height * width).expand(batch, -1)
@@ -243,14 +237,7 @@ class WorldMirror(nn.Module):
         return GaussianOutput(depth=depth, conf=conf, pixels=pixels, merged=merged)
 
     def _dense(self, head: DptHead, features: TrunkFeatures) -> Float[Tensor, "batch view channel height width"]:
-        raw = head(
-            features.flat(),
-            specials=features.specials,
-            grid=features.grid,
-            size=features.size,
-            checkpoint=self.checkpoint_activations,
-        )
-        return torch.unflatten(raw, 0, features.collected[0].shape[:2])
+        return dense_map(head, features, checkpoint=self.checkpoint_activations)
 
 
 def batch_priors(priors: Priors | None) -> BatchPriors | None:
@@ -267,10 +254,6 @@ def batch_priors(priors: Priors | None) -> BatchPriors | None:
         intrinsics_px=lift(priors.intrinsics_px),
         posed=lift(priors.posed),
     )
-
-
-def _channels_last(raw: Float[Tensor, "batch view channel height width"]) -> VectorMap:
-    return raw.permute(0, 1, 3, 4, 2)
 
 
 def _first_scene(batch: BatchPrediction) -> Prediction:

@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sceneexpander.models.layers.outputs import Cameras
 from sceneexpander.models.protocol import ALL_HEADS, Head
-from sceneexpander.models.worldmirror.model import BatchPrediction, Cameras, GaussianOutput, WorldMirror
+from sceneexpander.models.worldmirror.model import BatchPrediction, GaussianOutput, WorldMirror
 from sceneexpander.models.worldmirror.priors import BatchPriors
 
 

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.rigid import rotation_angle_deg
-from sceneexpander.models.mini.normals import normals_from_depth
 from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.protocol import GEOMETRY_HEADS, Prediction, Reconstructor
 

@@ -1,4 +1,4 @@
-"""Image files -> network input, as the official inference does it (worldmirror spec 2.2)."""
+"""Image files -> network input, as the official inference of WorldMirror and OmniVGGT does it (worldmirror spec 2.2)."""
 
 from __future__ import annotations
 
@@ -32,14 +32,24 @@ def load_images(
         raise UserError("there are no images", fix="give at least one image file")
     pictures = []
     for file in files:
-        try:
-            with Image.open(file) as image:
-                pictures.append(preprocess_image(image, target=target, strategy=strategy, multiple=multiple))
-        except FileNotFoundError:
-            raise UserError("does not exist", where=file, fix="check the path") from None
-        except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-            raise UserError(f"cannot be read as an image ({error})", where=file, fix="replace the file") from None
+        pictures.append(preprocess_image(read_image(file), target=target, strategy=strategy, multiple=multiple))
     return stack_padded(pictures)
+
+
+def read_image(file: Path) -> Image.Image:
+    """The decoded picture.
+
+    Raises:
+        UserError: if the file cannot be read as an image.
+    """
+    try:
+        with Image.open(file) as image:
+            image.load()
+            return image
+    except FileNotFoundError:
+        raise UserError("does not exist", where=file, fix="check the path") from None
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise UserError(f"cannot be read as an image ({error})", where=file, fix="replace the file") from None
 
 
 def preprocess_image(
@@ -61,15 +71,25 @@ def preprocess_image(
     image = image.convert("RGB")
     width, height = image.size
     if strategy == "crop" or width >= height:
-        size = (target, _rounded(height * (target / width), multiple))
+        size = (target, fitted_height(width, height, target=target, multiple=multiple))
     else:
         size = (_rounded(width * (target / height), multiple), target)
     pixels = np.asarray(image.resize(size, Image.Resampling.BICUBIC), dtype=np.float32) / 255
     picture = torch.from_numpy(pixels).permute(2, 0, 1)
     if strategy == "pad":
         return _padded(picture, target, target)
-    top = max(picture.shape[1] - target, 0) // 2
+    top = crop_top(picture.shape[1], target)
     return picture[:, top : top + target]
+
+
+def fitted_height(width: int, height: int, *, target: int, multiple: int) -> int:
+    """Height of a ``width x height`` picture once its width is ``target``, before any crop."""
+    return _rounded(height * (target / width), multiple)
+
+
+def crop_top(height: int, target: int) -> int:
+    """First row that a central crop to at most ``target`` rows keeps."""
+    return max(height - target, 0) // 2
 
 
 def _rounded(length: float, multiple: int) -> int:
