@@ -3,6 +3,9 @@
 A ``.pt``/``.pth``/``.ckpt``/``.bin`` file is a zip archive with a pickle, and a pickle is a program. This reader never hands it to
 ``torch.load``: its own unpickler knows a closed list of names (tensor rebuilding, storages, ordered dictionaries), all of them bound to
 functions of this module, and refuses every other name before anything is called. So no checkpoint can run code here.
+
+Some checkpoints carry the settings of their training beside the weights (argparse or OmegaConf objects, NumPy scalars, paths). A
+second closed list has their names; all of them stand for an object that holds nothing, does nothing and is left out of the result.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ STORAGE_DTYPES = {
     "BoolStorage": torch.bool,
 }
 STATE_DICT_KEYS = ("state_dict", "model_state_dict", "model")  # where training scripts put the weights
+WRAPPER = "module."
 
 
 class RefusedPickleError(Exception):
@@ -79,6 +83,24 @@ class _Entries(OrderedDict[object, object]):
 
     def __setstate__(self, state: object) -> None:
         return
+
+
+class _Inert:
+    """Stands for any object of a training script's settings: takes whatever a pickle gives it, keeps nothing."""
+
+    __slots__ = ()
+
+    def __new__(cls, *_arguments: object, **_named: object) -> _Inert:
+        return super().__new__(cls)
+
+    def __setstate__(self, state: object) -> None:
+        return
+
+    def __setitem__(self, key: object, value: object) -> None:
+        return
+
+    def extend(self, values: object) -> None:
+        """Part of how pickles fill lists."""
 
 
 class _Function(_Sealed):
@@ -144,7 +166,27 @@ def _rebuild_parameter(data: object, *_ignored: object) -> _View:
     return data
 
 
+# Settings beside the weights, as CUT3R (argparse, OmegaConf) and other training scripts save them.
+INERT = {
+    "argparse": ("Namespace",),
+    "omegaconf.dictconfig": ("DictConfig",),
+    "omegaconf.listconfig": ("ListConfig",),
+    "omegaconf.base": ("ContainerMetadata", "Metadata"),
+    "omegaconf.nodes": ("AnyNode", "BooleanNode", "FloatNode", "IntegerNode", "StringNode"),
+    "typing": ("Any",),
+    "collections": ("defaultdict",),
+    "pathlib": ("Path", "PosixPath", "PurePosixPath"),
+    "numpy": ("dtype",),
+    "numpy.core.multiarray": ("scalar",),
+    "numpy._core.multiarray": ("scalar",),
+    "_codecs": ("encode",),
+    # What the types below are called in the older pickle format that PyTorch writes.
+    "__builtin__": ("bool", "dict", "float", "int", "list", "set", "str", "tuple", "unicode"),
+    "builtins": ("bool", "dict", "float", "int", "list", "set", "str", "tuple"),
+}
+
 ALLOWED: dict[tuple[str, str], object] = {
+    **{(module, name): _Inert for module, names in INERT.items() for name in names},
     ("collections", "OrderedDict"): _Entries,
     ("torch._utils", "_rebuild_tensor_v2"): _Function(_rebuild_tensor),
     ("torch._utils", "_rebuild_parameter"): _Function(_rebuild_parameter),
@@ -224,10 +266,17 @@ def _weights_of(content: object, path: Path, key: str | None) -> dict[str, Tenso
                     n: view.values for n, view in found.items() if isinstance(n, str) and isinstance(view, _View)
                 }
                 if tensors:
-                    return tensors
+                    return _without_wrapper(tensors)
         there = ", ".join(str(name) for name in list(content)[:5])
         raise UserError(f"has no dictionary of tensors (its entries: {there})", where=path, fix="name it with --key")
     raise UserError(f"holds a {type(content).__name__}, not a dictionary of tensors", where=path)
+
+
+def _without_wrapper(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Without the prefix that training on several devices gives every name."""
+    if all(name.startswith(WRAPPER) for name in tensors):
+        return {name.removeprefix(WRAPPER): tensor for name, tensor in tensors.items()}
+    return tensors
 
 
 def convert(source: Path, target: Path, *, key: str | None = None) -> int:

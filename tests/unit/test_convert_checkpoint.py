@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import os
 import pickle
+import sys
 import zipfile
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -115,8 +119,9 @@ def test_a_malicious_pickle_never_fires(tmp_path: Path, capsys: pytest.CaptureFi
         ("torch._utils", "_rebuild_qtensor"),
         ("torch.nn.modules.linear", "Linear"),
         ("collections", "OrderedDict.__class__"),
-        ("argparse", "Namespace"),
-        ("numpy._core.multiarray", "scalar"),
+        ("argparse", "FileType"),
+        ("omegaconf.omegaconf", "OmegaConf"),
+        ("numpy._core.multiarray", "_reconstruct"),
     ],
 )
 def test_names_off_the_list_are_refused_by_name(tmp_path: Path, module: str, name: str) -> None:
@@ -126,8 +131,51 @@ def test_names_off_the_list_are_refused_by_name(tmp_path: Path, module: str, nam
     assert f"{module}.{name}, which is not allowed" in error.value.line()
 
 
+def test_settings_beside_the_weights_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The layout of CUT3R's checkpoint: settings with a constructor call as text, an optimiser, wrapped names."""
+    module = ModuleType("omegaconf.dictconfig")
+    config = type("DictConfig", (), {"__module__": module.__name__})
+    module.DictConfig = config  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "omegaconf", ModuleType("omegaconf"))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    settings = config()
+    target = tmp_path / "side-effect"
+    call = f"__import__('os').mkdir({str(target)!r})"
+    settings.__dict__ |= {"_content": {"model": call, "types": [dict, Any, defaultdict(dict)]}, "_parent": settings}
+    content = {
+        "args": settings,
+        "namespace": argparse.Namespace(model=call, folder=Path("runs")),
+        "best_so_far": np.float64(0.25),
+        "optimizer": {"state": {0: {"exp_avg": torch.zeros(3)}}},
+        "epoch": 7,
+        "model": {"module.a.weight": torch.arange(6.0).view(2, 3), "module.a.alias": torch.ones(2)},
+    }
+    torch.save(content, tmp_path / "in.pth")
+    monkeypatch.undo()
+    assert convert(tmp_path / "in.pth", tmp_path / "out.safetensors") == 2
+    loaded = load_file(tmp_path / "out.safetensors")
+    assert loaded.keys() == {"a.weight", "a.alias"}
+    assert torch.equal(loaded["a.weight"], torch.arange(6.0).view(2, 3))
+    assert not target.exists()
+
+
+def test_settings_hide_no_code(tmp_path: Path) -> None:
+    target = tmp_path / "side-effect"
+    settings = argparse.Namespace(hook=Malicious(target))
+    path = write_archive(tmp_path / "in.pth", pickle.dumps({"args": settings}, protocol=2))
+    with pytest.raises(UserError, match="mkdir, which is not allowed"):
+        read_checkpoint(path)
+    assert not target.exists()
+
+
 @pytest.mark.parametrize(
-    "name", ["torch._utils\n_rebuild_tensor_v2", "torch\nFloatStorage", "collections\nOrderedDict"]
+    "name",
+    [
+        "torch._utils\n_rebuild_tensor_v2",
+        "torch\nFloatStorage",
+        "collections\nOrderedDict",
+        "argparse\nNamespace",
+    ],
 )
 def test_allowed_objects_cannot_be_changed_by_a_pickle(tmp_path: Path, name: str) -> None:
     # BUILD with a (None, attributes) state would set attributes on the object before it.

@@ -18,6 +18,7 @@ from sceneexpander.geometry.checks import OutputCheck
 FAMILIES = (
     "sceneexpander.conformance.worldmirror",
     "sceneexpander.conformance.omnivggt",
+    "sceneexpander.conformance.ttt3r",
     "sceneexpander.conformance.gaussians",
 )
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import torch
 
@@ -13,6 +15,8 @@ from sceneexpander.models.protocol import Reconstructor
 from sceneexpander.models.weights import HUB_FILE, ResolvedWeights, load_weights, resolve_weights
 
 DEFAULT_VARIANT = "default"
+_Config = TypeVar("_Config")
+_Model = TypeVar("_Model")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,14 +38,12 @@ def _mini(variant: str, weights: ResolvedWeights) -> Reconstructor:
 def _worldmirror(variant: str, weights: ResolvedWeights) -> Reconstructor:
     from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
 
-    configs: dict[str, Callable[[], WorldMirrorConfig]] = {
+    configs = {
         DEFAULT_VARIANT: WorldMirrorConfig.large,
         "large": WorldMirrorConfig.large,
         "tiny": WorldMirrorConfig.tiny,
     }
-    _check_variant("worldmirror", variant, tuple(configs))
-    with torch.device("meta"):
-        model = WorldMirror(configs[variant]())
+    model = _on_meta("worldmirror", variant, configs, WorldMirror)
     load_weights(model, weights.path)
     return model
 
@@ -54,11 +56,32 @@ def _omnivggt(variant: str, weights: ResolvedWeights) -> Reconstructor:
         "large": OmniVGGTConfig.large,
         "tiny": OmniVGGTConfig.tiny,
     }
-    _check_variant("omnivggt", variant, tuple(configs))
-    with torch.device("meta"):
-        model = OmniVGGT(configs[variant]())
+    model = _on_meta("omnivggt", variant, configs, OmniVGGT)
     load_weights(model, weights.path)
     return model
+
+
+def _ttt3r(variant: str, weights: ResolvedWeights) -> Reconstructor:
+    from sceneexpander.models.ttt3r import TTT3R, TTT3RConfig
+
+    configs: dict[str, Callable[[], TTT3RConfig]] = {
+        DEFAULT_VARIANT: TTT3RConfig.large,
+        "large": TTT3RConfig.large,
+        "cut3r": partial(TTT3RConfig.large, update="cut3r"),
+        "tiny": TTT3RConfig.tiny,
+    }
+    model = _on_meta("ttt3r", variant, configs, TTT3R)
+    load_weights(model, weights.path)
+    return model
+
+
+def _on_meta(
+    name: str, variant: str, configs: Mapping[str, Callable[[], _Config]], make: Callable[[_Config], _Model]
+) -> _Model:
+    """The model of a variant without memory of its own, so that loading never holds random numbers beside the weights."""
+    _check_variant(name, variant, tuple(configs))
+    with torch.device("meta"):
+        return make(configs[variant]())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,6 +102,11 @@ _BUILDERS = {
         build=_omnivggt,
         licence="code MIT; the terms of the released weights (Livioni/OmniVGGT) are those of their own page, read them there",
         hub_file="OmniVGGT.safetensors",
+    ),
+    "ttt3r": _Family(
+        build=_ttt3r,
+        licence="weights: CUT3R, CC BY-NC-SA 4.0 (no commercial use; adapted weights under the same licence); additions of "
+        "TTT3R: MIT",
     ),
 }
 
