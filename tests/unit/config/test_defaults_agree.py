@@ -1,0 +1,22 @@
+"""conf/ is the whole truth of a run; the code's own defaults must say the same, or a tuned value is silently lost."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.artifacts.store import to_plain
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.ingest import IngestConfig
+
+CONF = Path(__file__).parents[3] / "conf"
+
+
+@pytest.mark.parametrize(
+    ("group", "default"),
+    [("frontend", FrontendConfig()), ("adapt", AdaptConfig()), ("evaluate", EvaluateConfig()), ("scene", IngestConfig())],
+)
+def test_the_default_group_equals_the_default_of_the_code(group: str, default: object) -> None:
+    assert yaml.safe_load((CONF / group / "default.yaml").read_text()) == to_plain(default)
