@@ -80,6 +80,7 @@ class DenseConfig:
     weight_confident: float = 0.6  # confident, one other view agrees
     weight_raw: float = 0.001  # matched but not confident
     weight_point: float = 30.0  # sparse points: one speaks for the plain area around it, too
+    point_conflict: float = 0.1  # sparse points this far (log depth) from confident pixels around them are dropped
     weight_interpolation: float = 0.003  # interpolation of the sparse points
 
 
@@ -112,7 +113,7 @@ def dense_depth(
     sparse: SparsePoints,
     config: DenseConfig,
     *,
-    posed: Bool[Tensor, view] | None = None,
+    posed: Bool[Tensor, "view"] | None = None,
 ) -> DenseDepth:
     """Depth of every pixel of every view, from images, cameras and sparse points in the same world.
 
@@ -253,11 +254,10 @@ def _fill_view(
         value, weight = _blend(value, weight, np.log(matched.inverse_depth), trust)
     known = np.where(confident, weight, 0).astype(np.float32)
     known_value = value.copy()
-    if len(view.seen_depth):
-        column, row = view.seen_xy[:, 0].astype(int), view.seen_xy[:, 1].astype(int)
-        log_inverse = -np.log(view.seen_depth).astype(np.float32)
-        value[row, column], weight[row, column] = log_inverse, config.weight_point
+    row, column, log_inverse = _credible_points(view, confident, value, config.point_conflict)
+    if len(row):
         known_value[row, column], known[row, column] = log_inverse, config.weight_point
+        value, weight = _blend(value, weight, *_spread_points(row, column, log_inverse, config.weight_point, shape))
     score = np.zeros(shape, np.float32)
     if known.any():
         min_size = max(4, round(config.min_segment_px * area))
@@ -277,6 +277,35 @@ def _fill_view(
     return np.exp(-filled), _evidence(
         view, matched, agreement, confident=confident, score=score, filled=filled, interpolated=interpolated
     )
+
+
+def _credible_points(
+    view: WorkView, confident: NDArray[np.bool_], log_inverse_depth: Image32, conflict: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Image32]:
+    """(row, column, log inverse depth) of the sparse points that agree with the confident pixels around them.
+
+    A point is judged only where more than half of the 5x5 pixels are confident: beside a depth edge both may be right.
+    """
+    column, row = view.seen_xy[:, 0].astype(np.int64), view.seen_xy[:, 1].astype(np.int64)
+    log_inverse = -np.log(view.seen_depth).astype(np.float32)
+    share = cv2.blur(confident.astype(np.float32), (5, 5))
+    nearby = cv2.blur(np.where(confident, log_inverse_depth, 0).astype(np.float32), (5, 5)) / np.maximum(share, 1e-6)
+    contradicted = (share[row, column] > 0.5) & (np.abs(nearby[row, column] - log_inverse) > conflict)
+    keep = ~contradicted
+    return row[keep], column[keep], log_inverse[keep]
+
+
+def _spread_points(
+    row: NDArray[np.int64], column: NDArray[np.int64], value: Image32, weight: float, shape: tuple[int, int]
+) -> tuple[Image32, Image32]:
+    """(mean value, weight) images of points spread over 3x3 pixels: one pixel could be cut off by its own colour edges."""
+    total, sums = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            at = np.clip(row + dy, 0, shape[0] - 1), np.clip(column + dx, 0, shape[1] - 1)
+            np.add.at(total, at, np.float32(weight / 9))
+            np.add.at(sums, at, np.float32(weight / 9) * value)
+    return (sums / np.maximum(total, 1e-9)).astype(np.float32), total
 
 
 def _blend(value: Image32, weight: Image32, other: Image32, other_weight: Image32) -> tuple[Image32, Image32]:
