@@ -52,15 +52,19 @@ def wait_for_samples(folder: Path) -> None:
         time.sleep(2)
 
 
+def settings(config: DictConfig) -> TrainConfig:
+    """The typed form of the configuration."""
+    values: dict[str, Any] = OmegaConf.to_container(config.train, resolve=True)  # type: ignore[assignment]
+    weights: dict[str, Any] = OmegaConf.to_container(config.weights, resolve=True)  # type: ignore[assignment]
+    return replace(TrainConfig(**values), weights=LossWeights(**weights))
+
+
 def train(config: DictConfig) -> None:
     """Train, or go on training."""
     folder, samples = Path(config.folder), Path(config.samples)
-    values: dict[str, Any] = OmegaConf.to_container(config.train, resolve=True)  # type: ignore[assignment]
-    weights: dict[str, Any] = OmegaConf.to_container(config.weights, resolve=True)  # type: ignore[assignment]
-    settings = replace(TrainConfig(**values), weights=LossWeights(**weights))
     folder.mkdir(parents=True, exist_ok=True)
     validation = make_validation(Path(config.validation), config.validation_scenes, config.validation_seed)
-    trainer = Trainer(settings, MiniConfig(), folder, samples)
+    trainer = Trainer(settings(config), MiniConfig(), folder, samples)
     resumed = trainer.resume()
     logging.info(
         "%s at step %d, %d parameters", "resumed" if resumed else "started", trainer.step, parameters(trainer.model)
@@ -93,7 +97,7 @@ def fill(config: DictConfig) -> None:
 
 def export(config: DictConfig) -> None:
     """Write the averaged weights of the checkpoint as the package ships them (half precision, configuration inside)."""
-    trainer = Trainer(TrainConfig(), MiniConfig(), Path(config.folder), Path(config.samples))
+    trainer = Trainer(settings(config), MiniConfig(), Path(config.folder), Path(config.samples))
     if not trainer.resume():
         raise SystemExit(f"no checkpoint in {config.folder}")
     model: Mini = trainer.ema_model()

@@ -28,6 +28,7 @@ class MiniConfig:
     head_width: int = 32
     camera_blocks: int = 2
     camera_steps: int = 2
+    camera_gain: float = 0.02  # share of the camera head's residual that is applied, see `Mini._cameras`
     max_log_residual: float = 2.0  # the depth residual saturates at e^2 = 7.4 times the base
     confident_pull: float = 0.9  # share of the residual that confident pixels ignore
     splat_std_px: float = 0.55  # standard deviation of a Gaussian in pixels of its own view

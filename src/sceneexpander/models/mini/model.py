@@ -52,7 +52,7 @@ class Mini(nn.Module):
         priors: Priors | None = None,
         *,
         heads: frozenset[Head] = ALL_HEADS,
-        generated: Bool[Tensor, " view"] | None = None,
+        generated: Bool[Tensor, "view"] | None = None,
     ) -> Prediction:
         """Reconstruct S views, see `Reconstructor.predict`.
 
@@ -86,7 +86,12 @@ class Mini(nn.Module):
         if depth is not None and depth_conf is not None and normals is not None and Head.GAUSSIANS in heads:
             flags = torch.zeros(views, dtype=torch.bool, device=images.device) if generated is None else generated
             transparent = covered_by_others(
-                depth, required.confident, world_from_cam, intrinsics, most_views=self.config.cross_views
+                depth,
+                required.confident,
+                world_from_cam,
+                intrinsics,
+                required.posed,
+                most_views=self.config.cross_views,
             )
             gaussians, gaussian_depth = pixel_aligned_gaussians(
                 images,
@@ -153,7 +158,10 @@ class Mini(nn.Module):
         scale = poses.new_ones(9)
         scale[:3] = priors.scale
         start = camera_vector_from_pose(poses, priors.intrinsics_px, height, width)
-        vector = self.network.camera_head(tokens[None], (start / scale)[None])[-1][0] * scale
+        refined = self.network.camera_head(tokens[None], (start / scale)[None])[-1][0] * scale
+        # Adam moves every weight by about the learning rate, which adds up over the width of a linear layer: without this gain
+        # one step of test-time adaptation would turn cameras by a degree, and bundle adjustment is better than that.
+        vector = start + self.config.camera_gain * (refined - start)
         # The first view is the world: only its fields of view may change.
         pose_part = torch.cat([start[:1, :7], vector[1:, :7]])
         fov = vector[:, 7:].clamp(0.05, 3.0)

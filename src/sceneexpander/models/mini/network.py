@@ -71,22 +71,20 @@ class MiniNetwork(nn.Module):
         sizes = DptConfig(features=config.features, out_channels=config.dpt_widths, hidden=config.head_width)
         # One decoder for all dense heads; each head has its own last layers.
         self.decoder = DptHead(2 * config.width, 1, sizes)
-        del self.decoder.scratch.output_conv2
+        self.decoder.get_submodule("scratch").output_conv2 = nn.Identity()
         self.skip_half = nn.Conv2d(half, config.features // 2, 1)
         self.skip_quarter = nn.Conv2d(quarter, config.features, 1)
         self.skip_eighth = nn.Conv2d(eighth, config.features, 1)
         self.depth_head = _dense_head(config, 2)  # log depth residual, confidence logit
         self.normals_head = _dense_head(config, 4)  # normal residual, confidence logit
         self.gaussian_head = _dense_head(config, SPLAT_RESIDUALS)
-        predictor = self.camera_head.get_submodule(self.camera_head.names.predictor)
-        for last in (
-            self.depth_head[-1],
-            self.normals_head[-1],
-            self.gaussian_head[-1],
-            predictor.get_submodule("fc2"),
-        ):
-            for parameter in last.parameters():
-                nn.init.zeros_(parameter)
+        for head in (self.depth_head, self.normals_head, self.gaussian_head):
+            _zero(head[-1])
+        self.reset_camera_residual()
+
+    def reset_camera_residual(self) -> None:
+        """Make the camera head return the prior cameras (it stays adaptable: its last layer still receives gradients)."""
+        _zero(self.camera_head.get_submodule(self.camera_head.names.predictor).get_submodule("fc2"))
 
     def features(self, inputs: WorkingViews) -> Features:
         """Run stem, trunk and decoder once for all heads."""
@@ -127,3 +125,8 @@ def _dense_head(config: MiniConfig, outputs: int) -> nn.Sequential:
         nn.ReLU(),
         nn.Conv2d(config.head_width, outputs, 1),
     )
+
+
+def _zero(layer: nn.Module) -> None:
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)

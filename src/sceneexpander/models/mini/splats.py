@@ -66,12 +66,14 @@ def covered_by_others(
     confident: Float[Tensor, "view height width"],
     world_from_cam: Float[Tensor, "view 4 4"],
     intrinsics_px: Float[Tensor, "view 3 3"],
+    posed: Bool[Tensor, "view"],
     *,
     most_views: int,
 ) -> Float[Tensor, "view height width"]:
     """1 where a pixel is a guess and another view confidently sees the same space: its surface, or free space there.
 
-    A guess behind another view's confident surface is hidden from that view and stays.
+    A guess behind another view's confident surface is hidden from that view and stays. A view without a pose covers
+    nothing, and gives way to everything that a posed view sees.
     """
     views, height, width = depth.shape
     out = torch.zeros_like(depth)
@@ -84,12 +86,19 @@ def covered_by_others(
     centres = world_from_cam[:, :3, 3]
     tolerance = torch.tensor(SAME_SURFACE).log()
     for view in range(views):
-        distance = (centres - centres[view]).square().sum(-1)
-        distance[view] = torch.inf
-        others = distance.argsort()[: min(views - 1, most_views)]
+        candidates = posed.clone()
+        candidates[view] = False
+        others = torch.nonzero(candidates)[:, 0]
+        if not len(others):
+            continue
+        distance = (centres[others] - centres[view]).square().sum(-1)
+        others = others[distance.argsort()[:most_views]]
         seen, log_z, in_frame = sample_other_views(
             points[view], content[others], cam_from_world[others], intrinsics_px[others]
         )
         sees = in_frame & (log_z < seen[:, 0] + tolerance)
-        out[view] = (seen[:, 1] * sees).amax(0).view(height, width) * (1 - confident[view])
+        if bool(posed[view]):
+            out[view] = (seen[:, 1] * sees).amax(0).view(height, width) * (1 - confident[view])
+        else:
+            out[view] = sees.any(0).view(height, width).to(depth.dtype)
     return out

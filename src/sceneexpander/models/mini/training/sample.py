@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -14,10 +15,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
+from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.geometry.rigid import rigid_inverse
+from sceneexpander.models.mini.inputs import sample_other_views
 
 _SCHEMA = "mini-sample-1"
+_HIDDEN_BEHIND = 0.05  # log depth behind another view's surface at which a point counts as hidden
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +43,7 @@ class Sample:
     prior_log_depth: Float[Tensor, "view height width"]
     sparse_log_depth: Float[Tensor, "view height width"]  # interpolation of the sparse points, the trivial baseline
     evidence: Float[Tensor, "view channel height width"]
-    posed: Bool[Tensor, " view"]
+    posed: Bool[Tensor, "view"]
     wrong_focal: bool
     kind: str
     seed: int
@@ -94,6 +98,20 @@ class Sample:
             world_from_cam=rigid_inverse(truth[:1]) @ truth,
             prior_world_from_cam=rigid_inverse(prior[:1]) @ prior,
         )
+
+    def visible_from(self, view: int, others: Sequence[int]) -> Bool[Tensor, "height width"]:
+        """Pixels of a view whose true surface at least one of the other views sees, by true cameras and depth."""
+        height, width = self.log_depth.shape[-2:]
+        valid = self.valid[view]
+        depth = torch.where(valid, self.log_depth[view], 0.0).exp()
+        points = unproject_to_world(depth[None], self.intrinsics_px[view, None], self.world_from_cam[view, None])
+        chosen = torch.tensor(list(others))
+        surface = torch.where(self.valid[chosen], self.log_depth[chosen], 20.0)[:, None]
+        seen, log_z, in_frame = sample_other_views(
+            points.reshape(-1, 3), surface, rigid_inverse(self.world_from_cam[chosen]), self.intrinsics_px[chosen]
+        )
+        visible = in_frame & (log_z < seen[:, 0] + _HIDDEN_BEHIND)
+        return visible.any(0).view(height, width) & valid
 
     def halved(self) -> Sample:
         """The sample at half the resolution (all sizes used here are multiples of 28)."""

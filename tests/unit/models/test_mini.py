@@ -1,0 +1,425 @@
+"""The embedded reconstructor: what it does without training, what its parts promise, and that the shipped weights help."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sceneexpander.errors import UserError
+from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.normals import normals_from_depth
+from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
+from sceneexpander.geometry.rigid import rigid_from_parts, rigid_inverse, rotation_from_quat_wxyz
+from sceneexpander.models.mini import Mini, MiniConfig
+from sceneexpander.models.mini.inputs import compare_views, splat_log_depth, working_size
+from sceneexpander.models.mini.splats import covered_by_others
+from sceneexpander.models.mini.training.augment import mirrored
+from sceneexpander.models.mini.training.generate import Conditions, sample_of_scene
+from sceneexpander.models.mini.training.losses import confidence_loss, render_loss
+from sceneexpander.models.mini.training.measure import geometry_row
+from sceneexpander.models.mini.training.sample import Sample
+from sceneexpander.models.mini.training.trainer import LossWeights, TrainConfig, Trainer
+from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor
+from sceneexpander.synthetic.views import make_views
+
+TINY = MiniConfig(
+    work_px=64,
+    width=16,
+    attention_heads=1,
+    stem_widths=(8, 16, 16),
+    dpt_widths=(8, 8, 8, 8),
+    features=8,
+    head_width=8,
+    camera_blocks=1,
+    camera_gain=1.0,
+)
+
+
+def scene(views: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, Priors]:
+    """Random pictures and plausible priors; the first camera is the world."""
+    draw = torch.Generator().manual_seed(seed)
+    quat = torch.nn.functional.normalize(
+        torch.tensor([1.0, 0, 0, 0]) + 0.05 * torch.randn(views, 4, generator=draw), dim=-1
+    )
+    poses = rigid_from_parts(rotation_from_quat_wxyz(quat), 0.2 * torch.randn(views, 3, generator=draw))
+    poses[0] = torch.eye(4)
+    intrinsics = torch.tensor([[0.9 * width, 0, width / 2 + 1], [0, 0.9 * width, height / 2 - 1], [0, 0, 1]])
+    evidence = torch.rand(views, len(EVIDENCE_CHANNELS), height, width, generator=draw)
+    evidence[:, 0] = (evidence[:, 0] > 0.6).float()
+    coarse = 1 + 2 * torch.rand(views, 1, height // 14, width // 14, generator=draw)
+    depth = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bilinear")[:, 0]
+    priors = Priors(world_from_cam=poses, intrinsics_px=intrinsics.repeat(views, 1, 1), depth=depth, evidence=evidence)
+    return torch.rand(views, 3, height, width, generator=draw), priors
+
+
+def make_model(*, perturbed: bool = False, config: MiniConfig = TINY) -> Mini:
+    """A new model with fixed initial values; ``perturbed``: with last layers that are not zero."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = Mini(config)
+        if perturbed:
+            with torch.no_grad():
+                for parameter in model.parameters():
+                    parameter.add_(0.02 * torch.randn_like(parameter))
+    return model
+
+
+@pytest.fixture(scope="module")
+def held_out() -> list[Sample]:
+    """A few scenes with held-out textures and the real dense base, cameras slightly off."""
+    samples = []
+    for seed in (41, 42, 43):
+        views = make_views(seed, views=4, height=112, width=168, split="test", supersample=1.0)
+        conditions = Conditions(rotation_deg=0.05, baseline_fraction=0.005)
+        samples.append(sample_of_scene(views, 3, conditions, torch.Generator().manual_seed(seed)))
+    return samples
+
+
+def test_a_new_model_returns_the_base_depth_exactly_and_the_prior_cameras() -> None:
+    images, priors = scene(3, 56, 84)
+    prediction = make_model().predict(images, priors)
+    assert isinstance(make_model(), Reconstructor)
+    assert prediction.depth is not None
+    assert torch.equal(prediction.depth, priors.depth)
+    assert torch.equal(prediction.intrinsics_px, priors.intrinsics_px)
+    # The pose goes through a quaternion and back in float32.
+    torch.testing.assert_close(prediction.world_from_cam, priors.world_from_cam, atol=2e-6, rtol=0)
+
+
+def test_a_perturbed_model_changes_depth_and_cameras_but_not_the_world_frame() -> None:
+    images, priors = scene(3, 56, 84)
+    prediction = make_model(perturbed=True).predict(images, priors)
+    assert prediction.depth is not None
+    assert not torch.allclose(prediction.depth, priors.depth, rtol=1e-3)
+    assert not torch.allclose(prediction.world_from_cam[1:], priors.world_from_cam[1:], atol=1e-4)
+    torch.testing.assert_close(prediction.world_from_cam[0], torch.eye(4), atol=1e-6, rtol=0)
+
+
+def test_confident_pixels_move_a_tenth_as_far() -> None:
+    images, priors = scene(2, 56, 56)
+    model = make_model()
+    with torch.no_grad():
+        model.network.depth_head[-1].bias[0] = 0.3  # the same residual everywhere
+    depth = model.predict(images, priors, heads=frozenset({Head.DEPTH})).depth
+    assert depth is not None
+    moved = (depth / priors.depth).log()
+    confident = priors.evidence[:, 0] > 0.5
+    expected = 2 * torch.tanh(torch.tensor(0.15))
+    torch.testing.assert_close(moved[~confident], expected.expand_as(moved[~confident]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(moved[confident], (0.1 * expected).expand_as(moved[confident]), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("views", "height", "width"), [(1, 14, 28), (2, 70, 42), (4, 126, 84), (6, 42, 98)])
+def test_any_number_of_views_and_any_size_of_whole_patches(views: int, height: int, width: int) -> None:
+    images, priors = scene(views, height, width)
+    prediction = make_model(perturbed=True).predict(images, priors)
+    assert prediction.depth is not None
+    assert prediction.normals is not None
+    assert prediction.depth.shape == (views, height, width)
+    assert (prediction.depth > 0).all()
+    assert prediction.depth_conf is not None
+    assert (prediction.depth_conf > 1).all()
+    assert prediction.points is not None
+    assert prediction.points.shape == (views, height, width, 3)
+    assert prediction.gaussians is not None
+    assert len(prediction.gaussians) == views * height * width
+    torch.testing.assert_close(prediction.normals.norm(dim=-1), torch.ones(views, height, width))
+
+
+def test_normals_face_the_camera_even_when_the_head_disagrees() -> None:
+    images, priors = scene(2, 56, 84)
+    model = make_model()
+    with torch.no_grad():
+        model.network.normals_head[-1].bias[2] = 3.0  # pushes every normal away from the camera
+    prediction = model.predict(images, priors)
+    assert prediction.normals is not None
+    assert prediction.depth is not None
+    assert prediction.points is not None
+    to_points = prediction.points - prediction.world_from_cam[:, None, None, :3, 3]
+    rays = torch.einsum("vji,vhwj->vhwi", prediction.world_from_cam[:, :3, :3], to_points)
+    cosine = (torch.nn.functional.normalize(rays, dim=-1) * prediction.normals).sum(-1)
+    assert cosine.max() < 1e-5
+
+
+def test_analytic_normals_of_a_plane_are_its_normal() -> None:
+    intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])[None]
+    normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.4, -1.0]), dim=0)
+    y, x = torch.meshgrid(torch.arange(30) + 0.5, torch.arange(40) + 0.5, indexing="ij")
+    rays = torch.stack([(x - 20) / 50, (y - 15) / 50, torch.ones_like(x)], -1)
+    depth = (-2.0 / (rays @ normal))[None]
+    found = normals_from_depth(depth, intrinsics)
+    # Differences of exact points of a plane lie in it; borders use one-sided differences, equally exact.
+    torch.testing.assert_close(found, normal.expand_as(found), atol=1e-4, rtol=0)
+
+
+def test_points_are_the_unprojected_depth() -> None:
+    images, priors = scene(2, 56, 84)
+    prediction = make_model(perturbed=True).predict(images, priors)
+    assert prediction.points is not None
+    assert prediction.depth is not None
+    pixel, depth = project_points(prediction.points.flatten(1, 2), prediction.intrinsics_px, prediction.world_from_cam)
+    torch.testing.assert_close(depth, prediction.depth.flatten(1), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(pixel[0, 0], torch.tensor([0.5, 0.5]), atol=1e-3, rtol=0)
+
+
+def test_heads_that_nobody_asked_for_do_not_run() -> None:
+    images, priors = scene(2, 56, 56)
+    model = make_model()
+    called = []
+    for name in ("depth_head", "normals_head", "gaussian_head"):
+        model.network.get_submodule(name).register_forward_hook(lambda *_, name=name: called.append(name))
+    prediction = model.predict(images, priors, heads=frozenset({Head.CAMERA}))
+    assert called == []
+    assert prediction.depth is None
+    assert prediction.gaussians is None
+    prediction = model.predict(images, priors, heads=GEOMETRY_HEADS)
+    assert called == ["depth_head", "normals_head"]
+    assert prediction.points is None
+    assert prediction.gaussians is None
+    model.predict(images, priors, heads=ALL_HEADS)
+    assert called[2:] == ["depth_head", "normals_head", "gaussian_head"]
+
+
+def test_every_head_sends_gradients_into_the_trunk() -> None:
+    images, priors = scene(2, 56, 56)
+    model = make_model(perturbed=True)
+    outputs = {
+        "camera": lambda p: p.camera_vector[1:].sum(),
+        "depth": lambda p: p.depth.log().sum(),
+        "confidence": lambda p: p.depth_conf.sum(),
+        "normals": lambda p: p.normals[..., 0].sum(),
+        "points": lambda p: p.points.sum(),
+        "scales": lambda p: p.gaussians.scales.sum(),
+        "opacities": lambda p: p.gaussians.opacities.sum(),
+    }
+    for name, output in outputs.items():
+        model.zero_grad()
+        output(model.predict(images, priors)).backward()
+        weight = model.network.trunk.frame_blocks[0].attn.qkv.weight
+        assert weight.grad is not None, name
+        assert weight.grad.abs().max() > 0, name
+
+
+def test_training_and_evaluation_mode_agree_bit_for_bit() -> None:
+    images, priors = scene(2, 56, 56)
+    model = make_model(perturbed=True)
+    first = model.train().predict(images, priors)
+    second = model.eval().predict(images, priors)
+    assert first.depth is not None
+    assert second.depth is not None
+    assert torch.equal(first.depth, second.depth)
+    assert torch.equal(first.camera_vector, second.camera_vector)
+
+
+def test_permuting_the_views_after_the_first_permutes_the_outputs() -> None:
+    images, priors = scene(4, 56, 56)
+    model = make_model(perturbed=True)
+    order = torch.tensor([0, 3, 1, 2])
+    plain = model.predict(images, priors, heads=GEOMETRY_HEADS)
+    permuted = model.predict(images[order], priors.select(order), heads=GEOMETRY_HEADS)
+    assert plain.depth is not None
+    assert permuted.depth is not None
+    # Attention sums over the views in another order.
+    torch.testing.assert_close(permuted.depth, plain.depth[order], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(permuted.camera_vector, plain.camera_vector[order], rtol=1e-4, atol=1e-5)
+
+
+def test_depth_scales_with_the_priors() -> None:
+    images, priors = scene(3, 56, 56)
+    model = make_model(perturbed=True)
+    assert priors.depth is not None
+    assert priors.world_from_cam is not None
+    poses = priors.world_from_cam.clone()
+    poses[:, :3, 3] *= 7
+    larger = replace(priors, depth=priors.depth * 7, world_from_cam=poses)
+    small, large = model.predict(images, priors), model.predict(images, larger)
+    assert small.depth is not None
+    assert large.depth is not None
+    torch.testing.assert_close(large.depth, small.depth * 7, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(large.camera_vector[:, :3], small.camera_vector[:, :3] * 7, rtol=1e-3, atol=1e-4)
+
+
+def test_gaussians_know_their_view_and_whether_it_was_generated() -> None:
+    images, priors = scene(3, 28, 42)
+    generated = torch.tensor([False, False, True])
+    gaussians = make_model().predict(images, priors, generated=generated).gaussians
+    assert gaussians is not None
+    count = 28 * 42
+    assert gaussians.source_view.tolist() == [0] * count + [1] * count + [2] * count
+    assert torch.equal(gaussians.generated, generated.repeat_interleave(count))
+
+
+def test_a_guess_gives_way_to_a_view_that_sees_the_place() -> None:
+    poses = torch.eye(4).repeat(2, 1, 1)
+    intrinsics = torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]).repeat(2, 1, 1)
+    posed = torch.ones(2, dtype=torch.bool)
+    confident = torch.stack([torch.zeros(40, 40), torch.ones(40, 40)])
+    sure = torch.full((40, 40), 2.0)
+    for guess, expected in ((1.0, 1.0), (2.0, 1.0), (3.0, 0.0)):  # in front of the surface, on it, hidden behind it
+        depth = torch.stack([torch.full((40, 40), guess), sure])
+        covered = covered_by_others(depth, confident, poses, intrinsics, posed, most_views=4)
+        assert covered[0].unique().tolist() == [expected]
+        assert covered[1].unique().tolist() == [0.0]
+
+
+def test_cross_view_channels_tell_front_from_behind() -> None:
+    poses = torch.eye(4).repeat(2, 1, 1)
+    poses[1, 0, 3] = 0.1
+    intrinsics = torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]).repeat(2, 1, 1)
+    images = torch.full((2, 3, 40, 40), 0.5)
+    posed = torch.ones(2, dtype=torch.bool)
+    confident = torch.ones(2, 40, 40)
+    log_depth = torch.log(torch.stack([torch.full((40, 40), 3.0), torch.full((40, 40), 2.0)]))
+    channels = compare_views(images, log_depth, confident, poses, intrinsics, posed, most_views=4)
+    behind, in_front = channels[:, 2, 20, 20], channels[:, 3, 20, 20]
+    ratio = torch.log(torch.tensor(1.5))
+    torch.testing.assert_close(behind, torch.stack([ratio, torch.zeros(())]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(in_front, torch.stack([torch.zeros(()), ratio]), atol=1e-5, rtol=0)
+    posed[1] = False
+    assert compare_views(images, log_depth, confident, poses, intrinsics, posed, most_views=4).abs().max() == 0
+
+
+def test_splatted_depth_keeps_the_nearest_point() -> None:
+    intrinsics = torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]])
+    points = torch.tensor([[0.01, 0.01, 4.0], [0.01, 0.01, 2.0], [0.0, 0.0, -1.0]])
+    found = splat_log_depth(points, rigid_inverse(torch.eye(4)), intrinsics, 10, 10)
+    assert int(found.isfinite().sum()) == 1
+    assert found[5, 5].exp().item() == pytest.approx(2.0)
+
+
+def test_the_working_grid_keeps_the_aspect_and_bounds_the_cost() -> None:
+    assert working_size(252, 336, 192) == (144, 192)
+    assert working_size(1400, 1050, 192) == (192, 144)
+    assert working_size(14, 700, 192) == (32, 192)  # at least two patches
+
+
+@pytest.mark.parametrize("missing", ["world_from_cam", "intrinsics_px", "depth", "evidence"])
+def test_missing_priors_are_named(missing: str) -> None:
+    images, priors = scene(2, 28, 28)
+    with pytest.raises(ValueError, match=missing):
+        make_model().predict(images, replace(priors, **{missing: None}))
+    with pytest.raises(ValueError, match="front-end"):
+        make_model().predict(images)
+
+
+def test_sizes_that_are_no_whole_patches_are_refused() -> None:
+    images, priors = scene(2, 28, 28)
+    with pytest.raises(ValueError, match="multiple of 14"):
+        make_model().predict(images[..., :27], priors)
+
+
+def test_pixels_without_a_base_depth_get_one() -> None:
+    images, priors = scene(2, 28, 28)
+    assert priors.depth is not None
+    depth = priors.depth.clone()
+    depth[0, :14] = 0
+    found = make_model().predict(images, replace(priors, depth=depth)).depth
+    assert found is not None
+    assert (found > 0).all()
+    with pytest.raises(ValueError, match="no positive"):
+        make_model().predict(images, replace(priors, depth=torch.zeros_like(depth)))
+
+
+def test_weights_survive_half_precision_and_a_wrong_file_is_refused(tmp_path: Path) -> None:
+    images, priors = scene(2, 56, 56)
+    model = make_model(perturbed=True)
+    model.save_weights(tmp_path / "mini.safetensors")
+    loaded = Mini.from_weights(tmp_path / "mini.safetensors")
+    assert loaded.config == TINY
+    assert all(parameter.dtype == torch.float32 for parameter in loaded.parameters())
+    first, second = model.predict(images, priors).depth, loaded.predict(images, priors).depth
+    assert first is not None
+    assert second is not None
+    # Half precision keeps 11 bits of every weight.
+    torch.testing.assert_close(second, first, rtol=5e-3, atol=0)
+    from safetensors.torch import save_file
+
+    save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
+    with pytest.raises(UserError, match="no configuration"):
+        Mini.from_weights(tmp_path / "other.safetensors")
+
+
+def test_the_shipped_weights_are_small_and_no_worse_than_the_base(held_out: list[Sample]) -> None:
+    model = Mini.from_weights("builtin")
+    path = Path(__file__).parents[3] / "src/sceneexpander/models/mini/weights/mini.safetensors"
+    assert path.stat().st_size <= 25e6
+    rows = [geometry_row(model, sample) for sample in held_out]
+    for name, slack in (("abs_rel", 0.005), ("normals_deg", 0.0)):
+        network, base = (sum(row[f"{who}/{name}"] for row in rows) / len(rows) for who in ("network", "base"))
+        assert network <= base + slack, (name, network, base)
+    within, base_within = (sum(row[f"{who}/within"] for row in rows) / len(rows) for who in ("network", "base"))
+    assert within >= base_within - 0.005
+
+
+def test_a_stored_sample_is_the_sample(held_out: list[Sample], tmp_path: Path) -> None:
+    sample = held_out[0]
+    sample.save(tmp_path / "s.safetensors")
+    back = Sample.load(tmp_path / "s.safetensors")
+    assert back.inputs == sample.inputs == 3
+    assert len(back.images) == 4
+    torch.testing.assert_close(back.images, sample.images, atol=0.5 / 255 + 1e-6, rtol=0)
+    finite = sample.valid
+    assert torch.equal(back.valid, finite)
+    torch.testing.assert_close(back.log_depth[finite], sample.log_depth[finite], atol=2e-3, rtol=1e-3)
+
+
+def test_a_mirrored_sample_is_still_true(held_out: list[Sample]) -> None:
+    sample = mirrored(held_out[0])
+    depth = torch.where(sample.valid, sample.log_depth, 0.0).exp()
+    found = normals_from_depth(depth[:1], sample.intrinsics_px[:1], smoothing=0)
+    inner = sample.valid[:1].clone()
+    agreement = (found * sample.normals[:1]).sum(-1)[inner]
+    # Differences across edges disagree with the exact normals; most pixels are not on edges.
+    assert agreement.median() > 0.99
+    assert sample.visible_from(1, [0]).float().mean() == pytest.approx(
+        held_out[0].visible_from(1, [0]).float().mean().item(), abs=0.01
+    )
+
+
+def test_another_first_view_changes_only_the_frame(held_out: list[Sample]) -> None:
+    sample = held_out[0]
+    moved = sample.select_inputs([1, 0, 2])
+    torch.testing.assert_close(moved.world_from_cam[0], torch.eye(4), atol=1e-5, rtol=0)
+    relative = rigid_inverse(sample.world_from_cam[1]) @ sample.world_from_cam[0]
+    torch.testing.assert_close(moved.world_from_cam[1], relative, atol=1e-5, rtol=0)
+    assert torch.equal(moved.images[1], sample.images[0])
+
+
+def test_confidence_loss_is_least_where_confidence_is_one_over_the_error() -> None:
+    error = torch.full((1, 2, 2), 0.1)
+    valid = torch.ones(1, 2, 2, dtype=torch.bool)
+    losses = [float(confidence_loss(error, torch.full((1, 2, 2), c), valid)) for c in (5.0, 10.0, 20.0)]
+    assert losses[1] < min(losses[0], losses[2])
+
+
+def test_render_loss_is_zero_for_equal_pictures_only() -> None:
+    picture = torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    assert float(render_loss(picture, picture)) == pytest.approx(0, abs=1e-6)
+    assert float(render_loss(picture, picture.flip(-1))) > 0.05
+
+
+def test_training_lowers_the_loss_and_resumes_exactly(held_out: list[Sample], tmp_path: Path) -> None:
+    config = TrainConfig(seed=0, batch=2, warmup_steps=1, learning_rate=2e-3, weights=LossWeights())
+    batch = [sample.halved() for sample in held_out[:2]]
+
+    def trainer(folder: str) -> Trainer:
+        return Trainer(config, TINY, tmp_path / folder, tmp_path / "samples")
+
+    unbroken = trainer("a")
+    losses = [sum(v for k, v in unbroken.train_step(batch).items() if k in ("depth", "normals")) for _ in range(12)]
+    assert losses[-1] < losses[0]
+    first = trainer("b")
+    for _ in range(6):
+        first.train_step(batch)
+    first.save()
+    second = trainer("b")
+    assert second.resume()
+    assert second.step == 6
+    for _ in range(6):
+        second.train_step(batch)
+    for name, value in unbroken.model.state_dict().items():
+        assert torch.equal(value, second.model.state_dict()[name]), name
+        assert torch.equal(unbroken.ema[name], second.ema[name]), name
