@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import camera_vector_from_pose
-from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import transform_points
+from sceneexpander.models.derived import with_depth
 from sceneexpander.models.layers.init import initialise_layers, materialise, normal_
 from sceneexpander.models.layers.outputs import check_views
-from sceneexpander.models.pixel_aligned import MIN_DEPTH, pixel_aligned
+from sceneexpander.models.pixel_aligned import MIN_DEPTH
 from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction
 from sceneexpander.models.ttt3r.cameras import (
     PlannedStep,
@@ -90,34 +92,16 @@ class TTT3R(RecurrentNetwork):
         poses, points_self, conf = self._read(images, plan)
         world_from_cam = chain_resets(world_from_camera_pose(poses), [step.reset for step in plan if step.kept])
         intrinsics = intrinsics_from_points(points_self)
-        depth = points_self[..., 2].clamp(min=MIN_DEPTH)
-        normals = normals_from_depth(depth, intrinsics) if heads & {Head.NORMALS, Head.GAUSSIANS} else None
-        points = gaussians = None
-        if Head.POINTS in heads:
-            points = transform_points(world_from_cam, points_self.flatten(1, 2)).view(points_self.shape)
-        if Head.GAUSSIANS in heads:
-            gaussians = pixel_aligned(
-                images=images,
-                depth=depth,
-                depth_conf=conf,
-                world_from_cam=world_from_cam,
-                intrinsics_px=intrinsics,
-                normals=normals,
-                generated=generated,
-            )
-        return Prediction(
+        prediction = Prediction(
             camera_vector=camera_vector_from_pose(world_from_cam, intrinsics, *images.shape[-2:]),
             world_from_cam=world_from_cam,
             intrinsics_px=intrinsics,
-            depth=depth if Head.DEPTH in heads else None,
-            depth_conf=conf if Head.DEPTH in heads else None,
-            normals=normals if Head.NORMALS in heads else None,
-            normals_conf=conf if Head.NORMALS in heads else None,
-            points=points,
-            points_conf=None if points is None else conf,
-            gaussian_depth=None if gaussians is None else depth,
-            gaussians=gaussians,
         )
+        if Head.POINTS in heads:
+            points = transform_points(world_from_cam, points_self.flatten(1, 2)).view(points_self.shape)
+            prediction = replace(prediction, points=points, points_conf=conf)
+        depth = points_self[..., 2].clamp(min=MIN_DEPTH)
+        return with_depth(prediction, depth, conf, images=images, heads=heads, generated=generated)
 
     def _read(
         self, images: Float[Tensor, "view 3 height width"], plan: list[PlannedStep]
