@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sceneexpander.models.layers.dpt import DptConfig
 from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
@@ -31,13 +31,18 @@ def tiny_worldmirror(
     """A tiny model whose tokens and gains are not the near-zero values of a fresh one, so that every part matters."""
     generator = torch.Generator().manual_seed(seed)
     model = WorldMirror.create(config, generator=generator, checkpoint_activations=checkpoint_activations)
-    with torch.no_grad():
-        for name, parameter in model.named_parameters():
-            if name.endswith("gamma") or "token" in name or "pos_embed" in name:
-                parameter.add_(0.3 * torch.randn(parameter.shape, generator=generator))
-            elif name.endswith(("qkv.weight", "fc2.weight", "proj.weight")):
-                parameter.mul_(4)  # otherwise the residual stream hardly notices its blocks
+    make_sizeable(model, generator=generator)
     return model
+
+
+@torch.no_grad()
+def make_sizeable(model: nn.Module, *, generator: torch.Generator) -> None:
+    """Enlarge what is nearly zero in a fresh model: otherwise the residual stream hardly notices its blocks."""
+    for name, parameter in model.named_parameters():
+        if name.endswith("gamma") or "token" in name or "pos_embed" in name:
+            parameter.add_(0.3 * torch.randn(parameter.shape, generator=generator))
+        elif name.endswith(("qkv.weight", "fc2.weight", "proj.weight")):
+            parameter.mul_(4)
 
 
 def random_images(views: int, height: int = 28, width: int = 42, seed: int = 1) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from sceneexpander.conformance.recorder import Recorder
 from sceneexpander.conformance.registry import CaseRunner, KeyFamily, has_config, read_config
+from sceneexpander.conformance.sizes import backbone_sizes
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.checks import OutputCheck, compare_tensors
 from sceneexpander.geometry.rigid import rigid_from_parts, rigid_inverse
@@ -57,15 +58,7 @@ def config_from_case(case: dict[str, Any]) -> OmniVGGTConfig:
     public = case["model_config"]
     encoder, trunk, camera, dense = public["dino"], public["aggregator"], public["camera_head"], public["dpt_head"]
     return OmniVGGTConfig(
-        image_size=public["img_size"],
-        patch=public["patch_size"],
-        dim=public["embed_dim"],
-        encoder_depth=encoder["depth"],
-        encoder_heads=encoder["num_heads"],
-        trunk_depth=trunk["depth"],
-        trunk_heads=trunk["num_heads"],
-        registers=trunk["num_register_tokens"],
-        rope_base=float(trunk["rope_freq"]),
+        **backbone_sizes(public, encoder, trunk),
         collect=tuple(dense["intermediate_layer_idx"]),
         camera_depth=camera["trunk_depth"],
         camera_heads=camera["num_heads"],

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sceneexpander.conformance.registry import CaseRunner, KeyFamily, has_config, read_config
+from sceneexpander.conformance.sizes import backbone_sizes
 from sceneexpander.conformance.worldmirror_trace import Trace
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.checks import OutputCheck, compare_tensors
@@ -42,15 +43,7 @@ def config_from_case(case: dict[str, Any]) -> WorldMirrorConfig:
     public, encoder, trunk, camera = case["model"], case["dino"], case["trunk"], case["camera_head"]
     dense, splat_dense, splats = case["dpt_heads"], case["gs_head"], case["gs_renderer"]
     return WorldMirrorConfig(
-        image_size=public["img_size"],
-        patch=public["patch_size"],
-        dim=public["embed_dim"],
-        encoder_depth=encoder["depth"],
-        encoder_heads=encoder["num_heads"],
-        trunk_depth=trunk["depth"],
-        trunk_heads=trunk["num_heads"],
-        registers=trunk["num_register_tokens"],
-        rope_base=float(trunk["rope_freq"]),
+        **backbone_sizes(public, encoder, trunk),
         collect=tuple(trunk["intermediate_idxs"]),
         prior_prompting=public["enable_cond"],
         camera_depth=camera["trunk_depth"],

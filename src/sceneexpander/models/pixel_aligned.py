@@ -36,9 +36,13 @@ MIN_DEPTH = 1e-6  # of points behind their camera
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplatRule:
-    """The constants of the rule."""
+    """The constants of the rule.
 
-    std_px: float = 0.55  # standard deviation across, in pixels of the Gaussian's own view
+    ``std_px`` was chosen on a painted, slanted plane: 0.55 px loses 2 dB in the views themselves and 3 to 4 dB one and a half
+    times nearer, where 0.3 px leaves holes of 10 %.
+    """
+
+    std_px: float = 0.4  # standard deviation across, in pixels of the Gaussian's own view
     max_stretch: float = 3.0  # along the slant of a surface, 1 / cosine at most
     thickness: float = 0.2  # standard deviation along the normal / across
 

@@ -8,26 +8,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.priors import Priors
-from sceneexpander.models.layers.backbone import TrunkFeatures
-from sceneexpander.models.layers.camera_head import FOV_START, CameraHead, CameraHeadNames
+from sceneexpander.models.derived import with_depth
+from sceneexpander.models.layers.camera_head import FOV_START, CameraHeadNames
 from sceneexpander.models.layers.dpt import DptHead
-from sceneexpander.models.layers.init import initialise_backbone, materialise
+from sceneexpander.models.layers.family import BackboneModel
+from sceneexpander.models.layers.init import initialise_backbone
 from sceneexpander.models.layers.outputs import (
     Cameras,
     Map,
     VectorMap,
     cameras_from_vector,
     check_views,
-    dense_map,
     depth_and_conf,
     points_and_conf,
 )
 from sceneexpander.models.omnivggt.config import OmniVGGTConfig
 from sceneexpander.models.omnivggt.priors import BatchPriors, batch_priors, encode_priors
 from sceneexpander.models.omnivggt.transformer import Aggregator
-from sceneexpander.models.pixel_aligned import pixel_aligned
 from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction
 
 CAMERA_NAMES = CameraHeadNames(
@@ -54,52 +52,31 @@ class BatchPrediction:
     points_conf: Map | None = None
 
 
-class OmniVGGT(nn.Module):
+class OmniVGGT(BackboneModel):
     """The feed-forward reconstructor of omnivggt spec 2; parameter names are those of the public checkpoint.
 
     It has heads for cameras, depth and points. `predict` derives the rest: normals from the depth map, with its confidence
     (they can be no surer than what they are made of), and Gaussians by the rule of `sceneexpander.models.pixel_aligned`.
-    Nothing depends on ``train()``/``eval()``.
-
-    Args:
-        config: sizes.
-        checkpoint_activations: recompute activations in the backward pass instead of keeping them. Same values, same gradients.
     """
 
     name = "omnivggt"
-    requires_priors = False
+    config: OmniVGGTConfig
 
     def __init__(self, config: OmniVGGTConfig, *, checkpoint_activations: bool = False) -> None:
-        super().__init__()
-        self.config = config
-        self.checkpoint_activations = checkpoint_activations
-        self.size_multiple = config.patch
+        super().__init__(config, checkpoint_activations=checkpoint_activations)
         width = 2 * config.dim
         self.aggregator = Aggregator(config)
-        self.camera_head = CameraHead(
-            width,
-            depth=config.camera_depth,
-            heads=config.camera_heads,
-            steps=config.camera_steps,
-            names=CAMERA_NAMES,
-        )
+        self.camera_head = self._new_camera_head(CAMERA_NAMES)
         self.point_head = DptHead(width, 4, config.dpt)
         self.depth_head = DptHead(width, 2, config.dpt)
 
-    @classmethod
-    def create(
-        cls, config: OmniVGGTConfig, *, generator: torch.Generator, checkpoint_activations: bool = False
-    ) -> OmniVGGT:
-        """A freshly initialised model whose numbers come from ``generator`` alone. Cameras start without any effect."""
-        with torch.device("meta"):
-            model = cls(config, checkpoint_activations=checkpoint_activations)
-        materialise(model, device=generator.device)
-        trunk = model.aggregator
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw every parameter anew, as WorldMirror does; cameras start without any effect."""
+        trunk = self.aggregator
         tokens = (trunk.camera_token, trunk.register_token, trunk.depth_placeholder)
-        initialise_backbone(model, trunk.patch_embed, model.camera_head, tokens, generator=generator)
+        initialise_backbone(self, trunk.patch_embed, self.camera_head, tokens, generator=generator)
         for parameter in trunk.camera_adapters.parameters():
             nn.init.zeros_(parameter)
-        return model
 
     def predict(
         self,
@@ -128,23 +105,7 @@ class OmniVGGT(nn.Module):
         if batch.depth is None or batch.depth_conf is None:
             return prediction
         depth, conf = batch.depth[0], batch.depth_conf[0]
-        normals = normals_from_depth(depth, intrinsics)
-        if Head.DEPTH in heads:
-            prediction = replace(prediction, depth=depth, depth_conf=conf)
-        if Head.NORMALS in heads:
-            prediction = replace(prediction, normals=normals, normals_conf=conf)
-        if Head.GAUSSIANS in heads:
-            gaussians = pixel_aligned(
-                images=images,
-                depth=depth,
-                depth_conf=conf,
-                world_from_cam=poses,
-                intrinsics_px=intrinsics,
-                normals=normals,
-                generated=generated,
-            )
-            prediction = replace(prediction, gaussians=gaussians, gaussian_depth=depth)
-        return prediction
+        return with_depth(prediction, depth, conf, images=images, heads=heads, generated=generated)
 
     def forward(
         self,
@@ -179,9 +140,6 @@ class OmniVGGT(nn.Module):
             points=points,
             points_conf=points_conf,
         )
-
-    def _dense(self, head: DptHead, features: TrunkFeatures) -> Float[Tensor, "batch view channel height width"]:
-        return dense_map(head, features, checkpoint=self.checkpoint_activations)
 
     @staticmethod
     def _whole_cameras(cameras: Cameras, images: Float[Tensor, "view 3 height width"]) -> Cameras:

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.layers.activations import confidence, unit_vector
 from sceneexpander.models.layers.backbone import TrunkFeatures
-from sceneexpander.models.layers.camera_head import CameraHead
 from sceneexpander.models.layers.dpt import DptHead
-from sceneexpander.models.layers.init import materialise
+from sceneexpander.models.layers.family import BackboneModel
 from sceneexpander.models.layers.outputs import (
     Cameras,
     Map,
@@ -22,7 +21,6 @@ from sceneexpander.models.layers.outputs import (
     cameras_from_vector,
     channels_last,
     check_views,
-    dense_map,
     depth_and_conf,
     points_and_conf,
 )
@@ -66,29 +64,17 @@ class BatchPrediction:
     gaussians: GaussianOutput | None = None
 
 
-class WorldMirror(nn.Module):
-    """The feed-forward reconstructor of worldmirror spec 1; parameter names are those of the public checkpoint.
-
-    Nothing depends on ``train()``/``eval()``: there is no dropout, and activation checkpointing is its own switch.
-
-    Args:
-        config: sizes.
-        checkpoint_activations: recompute activations in the backward pass instead of keeping them. Same values, same gradients.
-    """
+class WorldMirror(BackboneModel):
+    """The feed-forward reconstructor of worldmirror spec 1; parameter names are those of the public checkpoint."""
 
     name = "worldmirror"
-    requires_priors = False
+    config: WorldMirrorConfig
 
     def __init__(self, config: WorldMirrorConfig, *, checkpoint_activations: bool = False) -> None:
-        super().__init__()
-        self.config = config
-        self.checkpoint_activations = checkpoint_activations
-        self.size_multiple = config.patch
+        super().__init__(config, checkpoint_activations=checkpoint_activations)
         width = 2 * config.dim
         self.visual_geometry_transformer = VisualGeometryTransformer(config)
-        self.cam_head = CameraHead(
-            width, depth=config.camera_depth, heads=config.camera_heads, steps=config.camera_steps
-        )
+        self.cam_head = self._new_camera_head()
         if Head.POINTS in config.heads:
             self.pts_head = DptHead(width, 4, config.dpt)
         if Head.DEPTH in config.heads:
@@ -99,16 +85,9 @@ class WorldMirror(nn.Module):
             self.gs_head = GaussianDptHead(width, config.gaussian_dpt)
             self.gs_renderer = GaussianParameters(config.gaussian_dpt.features // 2, config.gaussian.hidden)
 
-    @classmethod
-    def create(
-        cls, config: WorldMirrorConfig, *, generator: torch.Generator, checkpoint_activations: bool = False
-    ) -> WorldMirror:
-        """A freshly initialised model whose numbers come from ``generator`` alone (worldmirror spec 12.3)."""
-        with torch.device("meta"):
-            model = cls(config, checkpoint_activations=checkpoint_activations)
-        materialise(model, device=generator.device)
-        initialise(model, generator=generator)
-        return model
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw every parameter anew (worldmirror spec 12.3)."""
+        initialise(self, generator=generator)
 
     def predict(
         self,
@@ -235,9 +214,6 @@ class WorldMirror(nn.Module):
             for b in range(batch)
         ]
         return GaussianOutput(depth=depth, conf=conf, pixels=pixels, merged=merged)
-
-    def _dense(self, head: DptHead, features: TrunkFeatures) -> Float[Tensor, "batch view channel height width"]:
-        return dense_map(head, features, checkpoint=self.checkpoint_activations)
 
 
 def batch_priors(priors: Priors | None) -> BatchPriors | None:
