@@ -77,7 +77,7 @@ class TTT3RConfig:
 
     @classmethod
     def tiny(cls, *, update: UpdateRule = "ttt3r") -> TTT3RConfig:
-        """A complete but very small configuration (0.6 M parameters) for dry runs; nobody publishes weights for it."""
+        """A complete but very small configuration (0.9 M parameters) for dry runs; nobody publishes weights for it."""
         return cls(
             encoder_dim=64,
             encoder_depth=2,
