@@ -99,11 +99,11 @@ def shortest_path_order(world_from_cam: Float[Tensor, "camera 4 4"], *, last: in
 
 
 def orbit(
-    target: Float[Tensor, " 3"],
+    target: Float[Tensor, "3"],
     radius: float,
     frames: int,
     *,
-    up: Float[Tensor, " 3"],
+    up: Float[Tensor, "3"],
     elevation_rad: float = 0.3,
     start_rad: float = 0.0,
 ) -> Float[Tensor, "frame 4 4"]:
@@ -140,7 +140,7 @@ def spiral(
     return look_at(eye, target, -rotation[:, 1])
 
 
-def _key_times(poses: Float[Tensor, "key 4 4"], frames: int) -> Float[Tensor, " key"]:
+def _key_times(poses: Float[Tensor, "key 4 4"], frames: int) -> Float[Tensor, "key"]:
     """Frame time of every key, from 0 to frames - 1: steps as the square root of how far two keys are apart."""
     step = (poses[1:, :3, 3] - poses[:-1, :3, 3]).norm(dim=-1)
     turn = rotation_angle_deg(poses[:-1, :3, :3], poses[1:, :3, :3])
@@ -160,7 +160,7 @@ def _key_times(poses: Float[Tensor, "key 4 4"], frames: int) -> Float[Tensor, " 
     return torch.minimum(whole, (frames - len(times)) + index)
 
 
-def _tangents(differences: Float[Tensor, "segment value"], times: Float[Tensor, " key"]) -> Float[Tensor, "key value"]:
+def _tangents(differences: Float[Tensor, "segment value"], times: Float[Tensor, "key"]) -> Float[Tensor, "key value"]:
     """Velocity at the keys, zero at both ends: slopes of the neighbouring segments, the shorter one counting more."""
     length = (times[1:] - times[:-1])[:, None]
     slope = differences / length
@@ -170,7 +170,7 @@ def _tangents(differences: Float[Tensor, "segment value"], times: Float[Tensor, 
 
 
 def _hermite(
-    values: Float[Tensor, "key value"], times: Float[Tensor, " key"], segment: Tensor, fraction: Float[Tensor, " frame"]
+    values: Float[Tensor, "key value"], times: Float[Tensor, "key"], segment: Tensor, fraction: Float[Tensor, "frame"]
 ) -> Float[Tensor, "frame value"]:
     """Cubic Hermite spline through the values."""
     tangent = _tangents(values[1:] - values[:-1], times)
@@ -184,9 +184,9 @@ def _hermite(
 
 def _spherical_bezier(
     rotations: Float[Tensor, "key 3 3"],
-    times: Float[Tensor, " key"],
+    times: Float[Tensor, "key"],
     segment: Tensor,
-    fraction: Float[Tensor, " frame"],
+    fraction: Float[Tensor, "frame"],
 ) -> Float[Tensor, "frame 4"]:
     """The same spline for rotations: a cubic Bezier curve per segment, by repeated spherical interpolation."""
     # Velocities in the keys' own frames: a rotation vector has the same components in both frames that it connects.

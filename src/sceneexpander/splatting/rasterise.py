@@ -27,7 +27,7 @@ def rasterise(
     means: Float[Tensor, "gaussian 3"],
     quat_wxyz: Float[Tensor, "gaussian 4"],
     scales: Float[Tensor, "gaussian 3"],
-    opacities: Float[Tensor, " gaussian"],
+    opacities: Float[Tensor, "gaussian"],
     colours: Float[Tensor, "gaussian 3"] | Float[Tensor, "gaussian coefficient 3"],
     cam_from_world: Float[Tensor, "view 4 4"],
     intrinsics_px: Float[Tensor, "view 3 3"],
@@ -35,7 +35,7 @@ def rasterise(
     width: int,
     *,
     features: Float[Tensor, "gaussian feature"] | Float[Tensor, "view gaussian feature"] | None = None,
-    background: Float[Tensor, " 3"] | Float[Tensor, "view 3"] | None = None,
+    background: Float[Tensor, "3"] | Float[Tensor, "view 3"] | None = None,
     screen_offsets: Float[Tensor, "view gaussian 2"] | None = None,
     with_depth: bool = True,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen

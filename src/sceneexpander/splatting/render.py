@@ -31,7 +31,7 @@ def render(
     height: int,
     width: int,
     *,
-    background: Float[Tensor, " 3"] | Float[Tensor, "view 3"] | None = None,
+    background: Float[Tensor, "3"] | Float[Tensor, "view 3"] | None = None,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
 ) -> Render:
     """Render a scene; differentiable in the Gaussians and the camera poses (intrinsics are constants).

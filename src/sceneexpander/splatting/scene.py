@@ -21,7 +21,7 @@ class RasterScene:
     means: Float[Tensor, "gaussian 3"]
     quat_wxyz: Float[Tensor, "gaussian 4"]
     scales: Float[Tensor, "gaussian 3"]
-    opacities: Float[Tensor, " gaussian"]
+    opacities: Float[Tensor, "gaussian"]
     colours: Float[Tensor, "gaussian 3"] | Float[Tensor, "gaussian coefficient 3"]
     cam_from_world: Float[Tensor, "view 4 4"]
     intrinsics_px: Float[Tensor, "view 3 3"]

@@ -30,10 +30,10 @@ BYTES_PER_PAIR = 160  # of the temporaries while pairs are listed
 class _Ellipses:
     """Visible Gaussians on one image, in depth order."""
 
-    index: Int[Tensor, " visible"]  # into the scene's Gaussians
+    index: Int[Tensor, "visible"]  # into the scene's Gaussians
     mean2d: Float[Tensor, "visible 2"]
     conic: Float[Tensor, "visible 3"]  # (a, b, c): sigma = a dx^2 / 2 + b dx dy + c dy^2 / 2
-    opacity: Float[Tensor, " visible"]
+    opacity: Float[Tensor, "visible"]
     planes: Float[Tensor, "visible channel"]
     half_size: Float[Tensor, "visible 2"]  # of the box around alpha >= 1/255, pixels
 
@@ -166,7 +166,7 @@ def _project(scene: RasterScene, view: int) -> _Ellipses:
     )
 
 
-def scene_depth_key(z: Float[Tensor, " gaussian"]) -> Float[Tensor, " gaussian"]:
+def scene_depth_key(z: Float[Tensor, "gaussian"]) -> Float[Tensor, "gaussian"]:
     """What Gaussians are ordered by: camera z as float32, whatever the dtype of the scene."""
     return z.float()
 
@@ -200,7 +200,7 @@ def _bands(boxes: Int[Tensor, "visible 4"], scene: RasterScene) -> list[tuple[in
 @torch.no_grad()
 def _kept_pairs(
     ellipses: _Ellipses, boxes: Int[Tensor, "visible 4"], row0: int, row1: int, scene: RasterScene
-) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
+) -> tuple[Int[Tensor, "pair"], Int[Tensor, "pair"]]:
     """(index into the ellipses, pixel) of the pairs that contribute in rows [row0, row1): by pixel, then by depth."""
     x0, x1, y0, y1 = boxes.unbind(-1)
     y0, y1 = y0.clamp(row0, row1), y1.clamp(row0, row1)
@@ -224,8 +224,8 @@ def _kept_pairs(
 
 
 def _alpha(
-    ellipses: _Ellipses, gaussian: Int[Tensor, " pair"], pixel: Int[Tensor, " pair"], scene: RasterScene
-) -> tuple[Float[Tensor, " pair"], Bool[Tensor, " pair"]]:
+    ellipses: _Ellipses, gaussian: Int[Tensor, "pair"], pixel: Int[Tensor, "pair"], scene: RasterScene
+) -> tuple[Float[Tensor, "pair"], Bool[Tensor, "pair"]]:
     """(capped alpha, whether the pair is drawn at all)."""
     mean2d, conic = ellipses.mean2d[gaussian], ellipses.conic[gaussian]
     row = torch.div(pixel, scene.width, rounding_mode="floor")
@@ -236,7 +236,7 @@ def _alpha(
     return alpha, (sigma >= 0) & (alpha >= MIN_ALPHA)
 
 
-def _log_before(log_keep: Float[Tensor, " pair"], pixel: Int[Tensor, " pair"]) -> Float[Tensor, " pair"]:
+def _log_before(log_keep: Float[Tensor, "pair"], pixel: Int[Tensor, "pair"]) -> Float[Tensor, "pair"]:
     """Sum of ``log_keep`` (float64) over the earlier pairs of the same pixel; pairs are sorted by pixel."""
     running = log_keep.cumsum(0) - log_keep
     starts = torch.ones_like(pixel, dtype=torch.bool)
@@ -245,6 +245,6 @@ def _log_before(log_keep: Float[Tensor, " pair"], pixel: Int[Tensor, " pair"]) -
     return running - running[starts][segment]
 
 
-def _exclusive_transmittance(log_keep: Float[Tensor, " pair"], pixel: Int[Tensor, " pair"]) -> Float[Tensor, " pair"]:
+def _exclusive_transmittance(log_keep: Float[Tensor, "pair"], pixel: Int[Tensor, "pair"]) -> Float[Tensor, "pair"]:
     """What is left of the light in front of each pair, float64."""
     return torch.exp(_log_before(log_keep, pixel))
