@@ -19,7 +19,7 @@ from sceneexpander.geometry.camera import intrinsics_from_parts, unproject_to_wo
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import look_at, rigid_inverse
 from sceneexpander.models.omnivggt import OmniVGGT, OmniVGGTConfig
-from sceneexpander.models.omnivggt.preprocess import load_views, resize_nearest, usable_depth
+from sceneexpander.models.omnivggt.preprocess import PreparedViews, load_views, resize_nearest, usable_depth
 from sceneexpander.models.omnivggt.priors import batch_priors, encode_priors
 from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction, Reconstructor
 from sceneexpander.models.registry import build_reconstructor
@@ -199,11 +199,10 @@ def test_checkpointing_changes_neither_values_nor_gradients() -> None:
         (loss + out.gaussians.scales.log().sum()).backward()
         gradients.append({name: p.grad for name, p in model.named_parameters()})
     plain, recomputed = gradients
-    # Detached before use (the camera head's first token), or for a prior that was not given.
     idle = {name for name, gradient in plain.items() if gradient is None}
-    assert idle == {name for name in plain if "depth_patch_embed" in name or name.endswith("empty_pose_tokens")} - {
-        name for name in plain if plain[name] is not None
-    }
+    # For a prior that was not given, and detached before use (the camera head's first token).
+    embed = "aggregator.depth_patch_embed.proj"
+    assert idle == {f"{embed}.weight", f"{embed}.bias", "camera_head.empty_pose_tokens"}
     for name, gradient in plain.items():
         if gradient is not None:
             # The recomputation runs the same kernels on the same numbers.
@@ -262,23 +261,23 @@ def write_camera(path: Path, *, shift: float = 0.0, numbers: int = 21, centre: f
     path.write_text(" ".join((pose + f"70 0 {centre}\n0 70 30\n0 0 1\n").split()[:numbers]))
 
 
-def load(folder: Path) -> Prediction:
+def load(folder: Path) -> PreparedViews:
     files = sorted((folder / "images").iterdir())
-    prepared = load_views(files, cameras=folder / "cameras", depths=folder / "depths", target=42)
-    with torch.no_grad():
-        batch = tiny_omnivggt()(prepared.images[None], prepared.priors)
-    assert batch.depth.shape == (1, VIEWS, 28, 42)
-    assert prepared.priors.camera_views == (0, 1)
-    assert prepared.priors.depth_views == (2,)
-    intrinsics = prepared.priors.intrinsics_px[0, 0]
-    # 80 x 60 becomes 42 x 28: 31.5 rows round to two patches.
-    assert torch.allclose(intrinsics[0], torch.tensor([70 * 42 / 80, 0, 21.0]))
-    assert torch.allclose(intrinsics[1], torch.tensor([0, 70 * 28 / 60, 14.0]))
-    return batch
+    return load_views(files, cameras=folder / "cameras", depths=folder / "depths", target=42)
 
 
 def test_files_are_matched_by_their_stems(folder: Path) -> None:
-    load(folder)
+    prepared = load(folder)
+    priors = prepared.priors
+    assert priors.camera_views == (0, 1)
+    assert priors.depth_views == (2,)
+    assert priors.intrinsics_px is not None
+    # 80 x 60 becomes 42 x 28: 31.5 rows round to two patches.
+    assert torch.allclose(priors.intrinsics_px[0, 0, 0], torch.tensor([70 * 42 / 80, 0, 21.0]))
+    assert torch.allclose(priors.intrinsics_px[0, 0, 1], torch.tensor([0, 70 * 28 / 60, 14.0]))
+    with torch.no_grad():
+        batch = tiny_omnivggt()(prepared.images[None], priors)
+    assert batch.depth.shape == (1, *SHAPE)
 
 
 def spoil_image_size(folder: Path) -> None:
