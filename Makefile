@@ -10,7 +10,7 @@ export MLFLOW_DISABLE_TELEMETRY := true
 export MLFLOW_SERVER_ENABLE_JOB_EXECUTION := false
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: repro test test-unit test-conformance test-pipeline lint setup ui expand ablate mini-scores clean help
+.PHONY: repro test test-unit test-conformance test-pipeline lint setup ui view expand ablate mini-scores clean help
 
 help: ## What there is
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -47,6 +47,12 @@ test-pipeline: .venv/.stamp
 
 ui: .venv/.stamp ## Runs in the browser (loopback only)
 	$(PY) -m sceneexpander.ui
+
+# make view SCENE=courtyard ROUND=1
+view: SCENE ?= courtyard
+view: ROUND ?= 1
+view: .venv/.stamp ## Walk through a scene in the browser (loopback only): SCENE=, ROUND=, ARGS=
+	$(PY) -m sceneexpander.viewer "outputs/$(SCENE)" --round "$(ROUND)" $(ARGS)
 
 # make expand PHOTOS=folder INSERTED=picture.png PROMPT="Behind the table is a bench."
 # The values reach the shell as environment variables, so quotes in a sentence need no escaping.

@@ -22,6 +22,7 @@ def _round(scene: str, number: int, methods: list[str]) -> RoundSource:
                 name=method,
                 reconstruction=layout.reconstruction(scene, number, method),
                 renders=layout.renders(scene, number, method),
+                splats=layout.packed(scene, number, method),
                 metrics=layout.metrics(scene, number, method),
             )
             for method in methods

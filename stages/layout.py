@@ -62,6 +62,11 @@ def renders(scene: str, number: int, method: str) -> Path:
     return round_folder(scene, number) / "renders" / method
 
 
+def packed(scene: str, number: int, method: str) -> Path:
+    """`PackedSplats` of a method's reconstruction, for the page to walk through."""
+    return round_folder(scene, number) / "packed" / method
+
+
 def metrics(scene: str, number: int, method: str) -> Path:
     """Metrics of a method's reconstruction."""
     return round_folder(scene, number) / "metrics" / f"{method}.json"

@@ -98,7 +98,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
     project = Project(tmp_path_factory.mktemp("pipeline") / "project")
     executed = project.repro()
     assert executed[0] == "code"
-    assert len(executed) == 16, executed
+    assert len(executed) == 19, executed
     yield project
     shutil.rmtree(project.folder, ignore_errors=True)
 
@@ -161,6 +161,7 @@ def test_a_setting_reruns_only_what_reads_it(finished: Project) -> None:
         "resolve@room",
         "adapt@room-round0",
         "render@room-round0-sceneexpander",
+        "pack@room-round0-sceneexpander",
         "evaluate@room-round0-sceneexpander",
         "collect@room",
         "report",
@@ -295,7 +296,7 @@ def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_pa
     for path in (folder / "outputs" / "room").rglob("stats/*.json"):
         if json.loads(path.read_text())["started"] >= started:
             fresh.add(path.stem)
-    assert fresh == {"adapt", "render-sceneexpander", "evaluate-sceneexpander"}
+    assert fresh == {"adapt", "render-sceneexpander", "pack-sceneexpander", "evaluate-sceneexpander"}
 
 
 def test_the_pinned_dvc_still_has_what_the_locks_are_named_by() -> None:

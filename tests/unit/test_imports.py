@@ -25,7 +25,8 @@ ROOMS: dict[str, set[str]] = {
     "evaluation": {"artifacts", "geometry", "splatting"},
     "rendering": {"artifacts", "evaluation", "geometry", "splatting"},
     "tracking": {"artifacts", "evaluation"},
-    "report": {"artifacts", "evaluation"},
+    "viewer": {"artifacts", "geometry", "splatting"},
+    "report": {"artifacts", "evaluation", "viewer"},
     "conformance": {"artifacts", "geometry", "models", "splatting"},  # a command: runs recorded cases
 }
 # Entry points and what only they share: they may import every room, and no room imports them.

@@ -15,9 +15,12 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import Scene
-from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
+from sceneexpander.artifacts.store import ArtifactError, read_json, write_bytes_atomic, write_json_atomic
 from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.report.camera_map import camera_map
+from sceneexpander.report.words import method_words
+from sceneexpander.viewer.packed import PackedSplats
+from sceneexpander.viewer.page import ShownMethod, viewer_page
 
 FACTS = "page.json"
 _PICTURE_SIDE_PX = 720
@@ -31,6 +34,7 @@ class MethodSource:
     name: str
     reconstruction: Path
     renders: Path
+    splats: Path
     metrics: Path
 
 
@@ -74,7 +78,32 @@ def collect_scene(source: SceneSource, folder: Path) -> None:
         "statistics": _statistics(source.statistics),
         "rounds": [_round(item, scene, folder) for item in source.rounds],
     }
+    _write_viewers(source, scene, folder)
     write_json_atomic(folder / FACTS, facts)
+
+
+def _write_viewers(source: SceneSource, scene: Scene, folder: Path) -> None:
+    """One page to walk through per round, in a file of its own beside the round's media."""
+    pictures = dict(zip(scene.views.view_ids, scene.views.images, strict=True))
+    for item in source.rounds:
+        inserted = InsertedView.load(item.inserted).view
+        pictures[inserted.view_ids[0]] = inserted.images[0]
+        shown = []
+        for method in item.methods:
+            splats = PackedSplats.load(method.splats)
+            shown.append(ShownMethod(splats=splats, label=method_words(method.name, splats.model).label))
+        known = {view for method in shown for view in method.splats.cameras.view_ids}
+        page = viewer_page(
+            scene.name,
+            scene.round_spec(item.number).prompt,
+            shown,
+            {view: picture for view, picture in pictures.items() if view in known},
+        )
+        write_bytes_atomic(folder / _viewer_place(item.number), page.encode())
+
+
+def _viewer_place(number: int) -> str:
+    return f"round_{number}/viewer.html"
 
 
 def _captured(views: ViewSet, folder: Path) -> list[dict[str, Any]]:
@@ -117,6 +146,7 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
         "candidates": len(inserted.provenance),
         "inserted": f"{base}/inserted.jpg",
         "inserted_id": inserted.view.view_ids[0],
+        "viewer": _viewer_place(source.number),
         "sheet": f"{base}/sheet.png" if sheet.is_file() else None,
         "methods": methods,
         "series": {name: [record[name] for record in log] for name in _LOSSES if log and name in log[0]},

@@ -70,7 +70,7 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
     return {
         **{
             key: facts[key]
-            for key in ("number", "prompt", "full_prompt", "backend", "origin", "candidates", "inserted")
+            for key in ("number", "prompt", "full_prompt", "backend", "origin", "candidates", "inserted", "viewer")
         },
         "sheet": facts["sheet"] if facts["candidates"] > 1 else None,
         "warnings": facts["warnings"],

@@ -77,6 +77,7 @@ def filled(path: str) -> str:
         ),
         ("adapt", [layout.state("S", 2), layout.statistics("adapt", "S", 2)]),
         ("render", [layout.renders("S", 2, "backbone"), layout.statistics("render", "S", 2, "backbone")]),
+        ("pack", [layout.packed("S", 2, "backbone"), layout.statistics("pack", "S", 2, "backbone")]),
         ("evaluate", [layout.metrics("S", 2, "backbone"), layout.statistics("evaluate", "S", 2, "backbone")]),
         ("collect", [layout.PAGES / "S"]),
         ("report", [layout.REPORT, Path("results/metrics.json")]),

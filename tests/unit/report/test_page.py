@@ -20,6 +20,7 @@ from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect
 from sceneexpander.report.curve import loss_curve
 from sceneexpander.report.words import COLUMNS
 from sceneexpander.tracking import scene_runs
+from sceneexpander.viewer.packed import pack_splats
 from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
 
 NASTY = '<script>alert("1")</script> & "quotes"'
@@ -84,6 +85,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
         item.save(folder / name)
         (folder / "renders" / name).mkdir(parents=True)
         produce_renders(item, backbone, RenderConfig(frames=5, stills=2), folder / "renders" / name)
+        pack_splats(item).save(folder / "packed" / name)
         row(name, 20.0 + index).save(folder / "metrics" / f"{name}.json")
     write_json_atomic(
         folder / "report.json",
@@ -108,6 +110,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
                         name=name,
                         reconstruction=folder / name,
                         renders=folder / "renders" / name,
+                        splats=folder / "packed" / name,
                         metrics=folder / "metrics" / f"{name}.json",
                     )
                     for name in METHODS
@@ -147,7 +150,7 @@ class Links(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.scripts += tag == "script"
         for name, value in attrs:
-            if (name in {"src", "poster"} or (name.startswith("data-") and tag == "video")) and value and "/" in value:
+            if (name in {"src", "poster", "href"} or (name.startswith("data-") and tag == "video")) and value and "/" in value:
                 self.found.append(value)
 
 
@@ -155,6 +158,7 @@ def test_every_file_it_names_is_there_and_none_is_remote(page: Path) -> None:
     links = Links()
     links.feed(page.read_text())
     assert len(links.found) > 20
+    assert "media/room/round_1/viewer.html" in links.found
     for place in links.found:
         assert (page.parent / place).is_file(), place
     assert not re.search(r"(https?:)?//[a-z]", page.read_text().replace("http://www.w3.org", ""))

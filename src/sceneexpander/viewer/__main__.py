@@ -1,0 +1,72 @@
+"""``python -m sceneexpander.viewer outputs/<scene>``: walk through the scene of a round in the browser, on this machine only."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from torch import Tensor
+
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.scene import Scene
+from sceneexpander.errors import UserError, entry_point
+from sceneexpander.viewer.live import HOST, LiveViewer
+
+METHODS = ("captured", "backbone", "sceneexpander")  # the last one that exists is shown first
+LIMIT = 300_000
+
+
+def load_round(folder: Path, number: int) -> tuple[str, list[Reconstruction], dict[str, Tensor]]:
+    """Name of the scene, its reconstructions in a round and the pictures of their views.
+
+    Args:
+        folder: what the pipeline made of one scene, ``outputs/<scene>``.
+        number: of the round.
+
+    Raises:
+        UserError: nothing was made there yet, or not this round.
+    """
+    if not (folder / "scene").is_dir():
+        raise UserError("holds no scene", where=folder, fix="run `make repro` first, or name another scene")
+    base = folder / f"round_{number}"
+    found = [base / method / "reconstruction" for method in METHODS]
+    found = [path for path in found if path.is_dir()]
+    if not found:
+        rounds = sorted(path.name.removeprefix("round_") for path in folder.glob("round_[1-9]*"))
+        fix = f"there are rounds {', '.join(rounds)}" if rounds else "run `make repro` first"
+        raise UserError("holds no reconstruction", where=base, fix=fix)
+    scene = Scene.load(folder / "scene")
+    pictures = dict(zip(scene.views.view_ids, scene.views.images, strict=True))
+    for earlier in range(1, number + 1):
+        place = folder / f"round_{earlier}" / "inserted"
+        if place.is_dir():
+            view = InsertedView.load(place).view
+            pictures[view.view_ids[0]] = view.images[0]
+    return scene.name, [Reconstruction.load(path) for path in found], pictures
+
+
+@entry_point
+def main() -> None:
+    """Serve until interrupted."""
+    parser = argparse.ArgumentParser(prog="python -m sceneexpander.viewer", description=__doc__)
+    parser.add_argument("folder", type=Path, help="outputs/<scene>")
+    parser.add_argument("--round", type=int, default=1)
+    parser.add_argument("--port", type=int, default=8080)
+    parser.add_argument("--limit", type=int, default=LIMIT, help="Gaussians per method; fewer for a weak machine")
+    arguments = parser.parse_args()
+    if arguments.limit < 1:
+        raise UserError(f"must be at least 1, is {arguments.limit}", where="--limit")
+    title, reconstructions, pictures = load_round(arguments.folder, arguments.round)
+    viewer = LiveViewer(reconstructions, pictures, title=title, port=arguments.port, limit=arguments.limit)
+    print(f"viewer: http://{HOST}:{viewer.port} (stop with Ctrl-C)", flush=True)
+    try:
+        viewer.serve()
+    except KeyboardInterrupt:
+        viewer.stop()
+        sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()
