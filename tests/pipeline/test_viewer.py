@@ -188,8 +188,8 @@ def test_the_live_viewer_shows_what_we_render(tab: Page, tmp_path: Path) -> None
         tab.value("1")  # reads what was noted meanwhile
         assert all(address.startswith((f"http://{HOST}:{viewer.port}", "blob:", "data:")) for address in tab.requested)
     finally:
-        viewer.stop()
         tab.call("Page.navigate", url="about:blank")
+        viewer.stop()
 
 
 @pytest.mark.parametrize(

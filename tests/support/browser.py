@@ -116,7 +116,8 @@ def browser_page(profile: Path) -> Iterator[Page]:
         port = _debugging_port(profile, process)
         with urlopen(f"http://127.0.0.1:{port}/json/list", timeout=30) as answer:
             tabs = [tab for tab in json.load(answer) if tab["type"] == "page"]
-        with connect(tabs[0]["webSocketDebuggerUrl"], max_size=None, proxy=None) as socket:
+        # No pings: a browser that renders on a busy CPU may be late to answer, and is not gone.
+        with connect(tabs[0]["webSocketDebuggerUrl"], max_size=None, proxy=None, ping_interval=None) as socket:
             yield Page(socket)
     finally:
         # Its own session: the whole family of processes goes, and nobody else's.
