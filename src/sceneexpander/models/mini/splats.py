@@ -18,6 +18,8 @@ from sceneexpander.models.pixel_aligned import SplatRule, pixel_aligned
 
 SPLAT_RESIDUALS = 4  # log scale along the slant, log scale across, opacity logit, log depth offset
 _OPACITY_RANGE = (0.01, 0.97)  # of the analytic opacity, so that its logit stays finite
+_SNAP_ROUNDS = 3
+_SNAP_STEP = 0.08  # range of log depth within 3x3 pixels from which on it is an edge and not a slanted surface
 _OFFSET_LIMIT = 0.05  # the learned offset moves a Gaussian by 5 % of its depth at most
 
 
@@ -39,7 +41,7 @@ def pixel_aligned_gaussians(
     Cameras and normals receive no gradient from here.
     """
     log_scale, opacity_logit, offset = residuals[:, :2], residuals[:, 2], residuals[:, 3]
-    splat_depth = depth * (_OFFSET_LIMIT * torch.tanh(offset)).exp()
+    splat_depth = snap_to_surfaces(depth) * (_OFFSET_LIMIT * torch.tanh(offset)).exp()
     analytic = pixel_aligned(
         images=images,
         depth=splat_depth,
@@ -60,6 +62,21 @@ def pixel_aligned_gaussians(
     return gaussians, splat_depth
 
 
+def snap_to_surfaces(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view height width"]:
+    """Depth without in-between values at the edges of objects: a pixel between two surfaces joins the nearer one in log depth.
+
+    Such values come from smoothing and upsampling; a Gaussian placed there floats between the surfaces. A few rounds of 3x3
+    neighbourhoods turn a blurred step of several pixels into a sharp one; smooth surfaces stay as they are.
+    """
+    log_depth = depth.log()[:, None]
+    for _ in range(_SNAP_ROUNDS):
+        far = functional.max_pool2d(log_depth, 3, stride=1, padding=1)
+        near = -functional.max_pool2d(-log_depth, 3, stride=1, padding=1)
+        joined = torch.where(log_depth - near < far - log_depth, near, far)
+        log_depth = torch.where(far - near > _SNAP_STEP, joined, log_depth)
+    return log_depth[:, 0].exp()
+
+
 @torch.no_grad()
 def covered_by_others(
     depth: Float[Tensor, "view height width"],
@@ -70,10 +87,11 @@ def covered_by_others(
     *,
     most_views: int,
 ) -> Float[Tensor, "view height width"]:
-    """1 where a pixel is a guess and another view confidently sees the same space: its surface, or free space there.
+    """1 where a pixel's Gaussian must give way to what other views see, 0 where it stays.
 
-    A guess behind another view's confident surface is hidden from that view and stays. A view without a pose covers
-    nothing, and gives way to everything that a posed view sees.
+    It gives way if it is a guess and another view confidently sees the same space (its surface, or free space there), or, guess or not,
+    if at least two more views look through it than see it: floaters at the edges of objects. A guess behind another view's confident
+    surface is hidden from that view and stays. A view without a pose covers nothing, and gives way to everything that a posed view sees.
     """
     views, height, width = depth.shape
     out = torch.zeros_like(depth)
@@ -98,7 +116,12 @@ def covered_by_others(
         )
         sees = in_frame & (log_z < seen[:, 0] + tolerance)
         if bool(posed[view]):
-            out[view] = (seen[:, 1] * sees).amax(0).view(height, width) * (1 - confident[view])
+            covered = (seen[:, 1] * sees).amax(0).view(height, width) * (1 - confident[view])
+            through = (in_frame & (log_z < seen[:, 0] - tolerance)).sum(0)
+            agrees = (in_frame & ((log_z - seen[:, 0]).abs() <= tolerance)).sum(0)
+            # Two witnesses, not one: a single inserted view with wrong depth must not carve the captured scene.
+            contradicted = (through > agrees + 1).view(height, width)
+            out[view] = torch.maximum(covered, contradicted.to(depth.dtype))
         else:
             out[view] = sees.any(0).view(height, width).to(depth.dtype)
     return out
