@@ -72,9 +72,12 @@ def base_normals(sample: Sample, *, shrink: int = 2) -> Float[Tensor, "view heig
 
 
 @torch.no_grad()
-def geometry_row(model: Reconstructor, sample: Sample) -> dict[str, float]:
-    """All geometry numbers of one scene: network, base, interpolation of the sparse points, constant depth."""
-    valid = posed_pixels(sample)
+def geometry_row(model: Reconstructor, sample: Sample, *, unposed_count: bool = False) -> dict[str, float]:
+    """All geometry numbers of one scene: network, base, interpolation of the sparse points, constant depth.
+
+    ``unposed_count``: views without a pose count too, in the one scale of the scene.
+    """
+    valid = sample.valid[: sample.inputs] if unposed_count else posed_pixels(sample)
     prediction = model.predict(sample.input_images, sample.priors(), heads=GEOMETRY_HEADS)
     assert prediction.depth is not None and prediction.normals is not None  # noqa: S101, PT018 - both were asked for
     depths = {

@@ -92,7 +92,7 @@ def score_scene(model: Mini, seed: int, *, noisy: bool, front_end: bool) -> Scen
     overlapping: tuple[float, ...] = ()
     if front_end:
         own = own_cameras_sample(sample, generator, dense)
-        front_row = geometry_row(model, replace(own, posed=torch.ones_like(own.posed)))
+        front_row = geometry_row(model, own, unposed_count=True)
         errors, overlapping = pose_errors_deg(own)
     return SceneScores(
         true_cameras=row,
