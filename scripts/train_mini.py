@@ -101,6 +101,7 @@ def export(config: DictConfig) -> None:
     if not trainer.resume():
         raise SystemExit(f"no checkpoint in {config.folder}")
     model: Mini = trainer.ema_model()
+    model.network.shrink_depth_residual(config.export_gain)
     model.save_weights(Path(config.export_to))
     logging.info("step %d, %.0f minutes -> %s", trainer.step, trainer.seconds / 60, config.export_to)
 

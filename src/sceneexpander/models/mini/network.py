@@ -86,6 +86,13 @@ class MiniNetwork(nn.Module):
         """Make the camera head return the prior cameras (it stays adaptable: its last layer still receives gradients)."""
         _zero(self.camera_head.get_submodule(self.camera_head.names.predictor).get_submodule("fc2"))
 
+    @torch.no_grad()
+    def shrink_depth_residual(self, gain: float) -> None:
+        """Multiply the depth residual by a gain, by way of its last layer: less correction, fewer scenes made worse."""
+        last = self.depth_head[-1]
+        for parameter in last.parameters():
+            parameter[0] *= gain
+
     def features(self, inputs: WorkingViews) -> Features:
         """Run stem, trunk and decoder once for all heads."""
         config = self.config
