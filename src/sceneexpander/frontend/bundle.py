@@ -225,8 +225,8 @@ class _NormalEquations:
         coupling = self._coupling
         # Written out: einsum and batched matmul are an order slower on blocks this small.
         product = sum(coupling[:, :, i, None] * inverse[None, :, i] for i in range(3))
-        eliminated = np.asarray(product).reshape(self._size, -1)
-        matrix = hessian - eliminated @ self._coupling.reshape(self._size, -1).T
+        eliminated = np.asarray(product).reshape(self._size, 3 * len(inverse))
+        matrix = hessian - eliminated @ coupling.reshape(self._size, 3 * len(inverse)).T
         return matrix, -self._gradient + eliminated @ self._point_gradient.reshape(-1), inverse
 
     def step(self, damping: float) -> BundleProblem:

@@ -21,8 +21,7 @@ from sceneexpander.frontend.twoview import (
     usac_parameters,
 )
 
-_PRIOR_INFLATION = 20.0  # matching errors are correlated and partly systematic: that many of them count as one
-_FAR = 1e4  # points further away than this many baselines carry no depth
+_PRIOR_INFLATION = 8.0  # matching errors are correlated and partly systematic: that many of them count as one
 
 
 class Mapping:

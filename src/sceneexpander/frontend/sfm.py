@@ -280,17 +280,26 @@ def _map(
 ) -> tuple[Mapping, FocalSource]:
     """The best model over all focal starts and initial pairs, finished; and where its focal came from."""
     enough = len(setup.greys) >= config.min_views_for_focal or focal.source is not None
-    best: Mapping | None = None
     few = tracks.longest(config.sweep_tracks)
-    for start in focal.starts:
-        for pair in [None] if known.posed.any() else _initial_pairs(features, pairs, kinds, start, config, setup):
-            candidate = _new_mapping(few, start, focal, config, setup)
-            if pair is None:
-                _set_known_poses(candidate, known)
-            elif not _set_initial_pair(candidate, features, pairs[pair], config):
-                continue
-            candidate.grow(refine_focal=focal.refine and enough, free=_free_views(candidate, known, config))
-            if best is None or candidate.score() > best.score():
+
+    def grown(start: np.ndarray, pair: PairMatches | None) -> Mapping | None:
+        candidate = _new_mapping(few, start, focal, config, setup)
+        if pair is None:
+            _set_known_poses(candidate, known)
+        elif not _set_initial_pair(candidate, features, pair, config):
+            return None
+        candidate.grow(refine_focal=focal.refine and enough, free=_free_views(candidate, known, config))
+        return candidate
+
+    initial: list[PairMatches | None] = [None]
+    if not known.posed.any():
+        initial = _initial_pairs(features, pairs, kinds, focal.nominal, config, setup)
+    best: Mapping | None = None
+    for position, pair in enumerate(initial):
+        # The first pair finds the focal; further pairs only have to beat it there.
+        starts = focal.starts if position == 0 or best is None else (best.start_intrinsics,)
+        for candidate in (grown(start, pair) for start in starts):
+            if candidate is not None and (best is None or candidate.score() > best.score()):
                 best = candidate
     if best is None or not best.valid.any():
         empty = _new_mapping(tracks, focal.nominal, focal, config, setup)
@@ -359,10 +368,10 @@ def _initial_pairs(
     intrinsics: np.ndarray,
     config: SfmConfig,
     setup: _Setup,
-) -> list[int | None]:
-    """Indices of the most promising pairs to begin with: inliers x triangulation angle, capped."""
-    scored: list[tuple[float, int]] = []
-    for index, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
+) -> list[PairMatches | None]:
+    """The most promising pairs to begin with: inliers x triangulation angle, capped."""
+    scored: list[tuple[float, PairMatches]] = []
+    for pair, kind in zip(pairs, kinds, strict=True):
         if kind is not PairKind.PARALLAX:
             continue
         a, b = pair.view_a, pair.view_b
@@ -375,9 +384,9 @@ def _initial_pairs(
             seed=setup.seed,
         )
         if pose is not None and pose.angle_deg > config.min_angle_deg:
-            scored.append((float(pose.inlier.sum()) * min(pose.angle_deg, config.max_initial_angle_deg), index))
-    scored.sort(reverse=True)
-    return [index for _, index in scored[: config.initial_pairs]]
+            scored.append((float(pose.inlier.sum()) * min(pose.angle_deg, config.max_initial_angle_deg), pair))
+    scored.sort(key=lambda entry: -entry[0])
+    return [pair for _, pair in scored[: config.initial_pairs]]
 
 
 def _set_initial_pair(mapping: Mapping, features: list[Features], pair: PairMatches, config: SfmConfig) -> bool:

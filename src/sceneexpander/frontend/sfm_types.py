@@ -37,7 +37,7 @@ class SfmConfig:
     epipolar_px: float = 1.5  # MAGSAC noise scale for fundamental, essential and homography models
     min_pair_inliers: int = 15
     min_pair_inlier_share: float = 0.12
-    rotation_share: float = 0.85  # rotation-only: a pure rotation explains this share of the verified matches
+    rotation_share: float = 0.8  # rotation-only: a pure rotation explains this share of the verified matches
     rotation_px: float = 2.5
 
     # Focal length, in units of the long side.
@@ -156,6 +156,6 @@ class SparseReconstruction:
 
     world_from_cam: Float[Tensor, "view 4 4"]
     intrinsics_px: Float[Tensor, "view 3 3"]
-    posed: Bool[Tensor, " view"]
+    posed: Bool[Tensor, "view"]
     sparse: SparsePoints
     report: SfmReport
