@@ -16,7 +16,12 @@ CONF = Path(__file__).parents[3] / "conf"
 
 @pytest.mark.parametrize(
     ("group", "default"),
-    [("frontend", FrontendConfig()), ("adapt", AdaptConfig()), ("evaluate", EvaluateConfig()), ("scene", IngestConfig())],
+    [
+        ("frontend", FrontendConfig()),
+        ("adapt", AdaptConfig()),
+        ("evaluate", EvaluateConfig()),
+        ("scene", IngestConfig()),
+    ],
 )
 def test_the_default_group_equals_the_default_of_the_code(group: str, default: object) -> None:
     assert yaml.safe_load((CONF / group / "default.yaml").read_text()) == to_plain(default)

@@ -150,7 +150,11 @@ class Links(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.scripts += tag == "script"
         for name, value in attrs:
-            if (name in {"src", "poster", "href"} or (name.startswith("data-") and tag == "video")) and value and "/" in value:
+            if (
+                (name in {"src", "poster", "href"} or (name.startswith("data-") and tag == "video"))
+                and value
+                and "/" in value
+            ):
                 self.found.append(value)
 
 
