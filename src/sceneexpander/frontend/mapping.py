@@ -198,18 +198,33 @@ class Mapping:
             self.prune(threshold_px=self.config.triangulate_px)
 
     def finish(self, *, refine_focal: bool, free: Bool[np.ndarray, " view"] | None = None) -> None:
-        """Two rounds of re-triangulation, bundle adjustment and pruning, the second at the final threshold."""
+        """Rounds of re-triangulation, bundle adjustment and pruning, ever stricter.
+
+        The last rounds take the robust scale and the threshold from the errors themselves (their median is 1.18 sigma of
+        Gaussian noise in two dimensions), so that a few pixels of error count as wrong where features are sharp.
+        """
         for threshold in (self.config.triangulate_px, self.config.inlier_px):
             self.triangulate(threshold_px=threshold)
             self.adjust(refine_focal=refine_focal, free=free)
             self.prune(threshold_px=threshold)
-        self.adjust(refine_focal=refine_focal, free=free)
-        self.prune(threshold_px=self.config.inlier_px)
+        for _ in range(2):
+            errors = self.errors_px()[self.active & self.registered] / self.unit_px
+            sigma = float(np.median(errors)) / 1.18 if len(errors) else self.config.robust_px
+            robust = float(np.clip(2 * sigma, self.config.min_robust_px, self.config.robust_px))
+            threshold = float(np.clip(8 * sigma, self.config.min_inlier_px, self.config.inlier_px))
+            self.triangulate(threshold_px=threshold)
+            self.adjust(refine_focal=refine_focal, free=free, robust_px=robust)
+            self.prune(threshold_px=threshold)
 
     # --- adjusting ---------------------------------------------------------------------------------------------------
 
     def adjust(
-        self, *, refine_focal: bool, iterations: int | None = None, free: Bool[np.ndarray, " view"] | None = None
+        self,
+        *,
+        refine_focal: bool,
+        iterations: int | None = None,
+        free: Bool[np.ndarray, " view"] | None = None,
+        robust_px: float | None = None,
     ) -> BundleResult | None:
         """Bundle adjustment of all registered views and points (``free``: which cameras may move)."""
         rows, views = np.nonzero(self.active & self.registered)
@@ -222,7 +237,7 @@ class Mapping:
             free = self.registered.copy()
             free[np.flatnonzero(self.registered)[0]] = False
         centre, sigma = self.log_focal_prior
-        noise = self.config.robust_px * self.unit_px
+        noise = (robust_px or self.config.robust_px) * self.unit_px
         problem = BundleProblem(
             rotations=self.rotations,
             translations=self.translations,

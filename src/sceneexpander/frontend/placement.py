@@ -10,12 +10,20 @@ import numpy as np
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.mapping import Mapping, solve_pose
 from sceneexpander.frontend.sfm_types import SfmConfig
-from sceneexpander.frontend.twoview import PairMatches, fit_rotation
+from sceneexpander.frontend.twoview import (
+    PairMatches,
+    fit_rotation,
+    homogeneous_rays,
+    relative_pose,
+    triangulate_pair,
+)
 
 _MAX_REFERENCE_DISTANCE_PX = 2.0  # a matched keypoint this near (at 768 px) to a triangulated one is taken to be it
 _MIN_SPREAD = (
     0.12  # of the long side: standard deviation of a last-chance view's inliers, or the pose hangs on one spot
 )
+
+_MIN_PAIR_FOR_DISTANCE = 40  # verified matches: an essential matrix without a third view to confirm it needs plenty
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,10 +57,12 @@ def place_remaining(
             placed[int(view)] = found
             posed[view] = True
     before = -1
-    while posed.sum() > before:  # chains: a view may hang on one that was itself placed by rotation
+    while posed.sum() > before:  # chains: a view may hang on one that was itself placed here
         before = int(posed.sum())
         for view in np.flatnonzero(~posed):
             found = _rotation_only(mapping, features, pairs, int(view), np.flatnonzero(posed), config, rng=rng)
+            if found is None:
+                found = _assumed_distance(mapping, features, pairs, int(view), np.flatnonzero(posed), config)
             if found is not None:
                 placed[int(view)] = found
                 posed[view] = True
@@ -162,6 +172,62 @@ def _rotation_only(
     mapping.translations[view] = rotation @ mapping.translations[other]
     reason = f"no parallax: only its rotation relative to view {other} is known ({agreeing} matches)"
     return Placement(loose=True, reason=reason, like=other, inliers=agreeing)
+
+
+def _assumed_distance(
+    mapping: Mapping,
+    features: Sequence[Features],
+    pairs: Sequence[PairMatches],
+    view: int,
+    posed: np.ndarray,
+    config: SfmConfig,
+) -> Placement | None:
+    """Pose from the essential matrix with one posed view; its length such that both see things equally far away.
+
+    For views that share matches with a posed view, but on surfaces where nothing was triangulated.
+    """
+    candidates = []
+    for other in posed.tolist():
+        found = pair_of(pairs, view, other)
+        if found is not None and found[0].verified.count >= _MIN_PAIR_FOR_DISTANCE:
+            candidates.append((found[0].verified.count, other, found))
+    for _, other, (pair, first) in sorted(candidates, key=lambda entry: (-entry[0], entry[1])):
+        matches = pair.verified
+        mine, theirs = (matches.index_a, matches.index_b) if first else (matches.index_b, matches.index_a)
+        xy_other, xy_view = features[other].pixel_xy[theirs], features[view].pixel_xy[mine]
+        pose = relative_pose(
+            xy_other,
+            xy_view,
+            mapping.intrinsics[other],
+            mapping.intrinsics[view],
+            threshold_px=config.epipolar_px * mapping.unit_px,
+            seed=mapping.seed + view,
+        )
+        known = _visible_depths(mapping, other)
+        if pose is None or pose.inlier.mean() < 0.5 or pose.angle_deg < config.min_angle_deg or len(known) == 0:
+            continue
+        _, depths = triangulate_pair(
+            homogeneous_rays(xy_other[pose.inlier], mapping.intrinsics[other]),
+            homogeneous_rays(xy_view[pose.inlier], mapping.intrinsics[view]),
+            pose.rotation,
+            pose.translation,
+        )
+        length = float(np.median(known) / np.median(depths[:, 0]))
+        mapping.rotations[view] = pose.rotation @ mapping.rotations[other]
+        mapping.translations[view] = pose.rotation @ mapping.translations[other] + length * pose.translation
+        agreeing = int(pose.inlier.sum())
+        reason = (
+            f"its distance from view {other} is assumed ({agreeing} matches, none on points that other views share)"
+        )
+        return Placement(loose=True, reason=reason, like=other, inliers=agreeing)
+    return None
+
+
+def _visible_depths(mapping: Mapping, view: int) -> np.ndarray:
+    """Depths of the model's points in a view: those it observes, or else all in front of it."""
+    depths = mapping.points @ mapping.rotations[view][2] + mapping.translations[view][2]
+    observed = depths[mapping.active[:, view] & mapping.valid]
+    return observed if len(observed) else depths[mapping.valid & (depths > 0)]
 
 
 def _placeholder(

@@ -32,9 +32,18 @@ from sceneexpander.frontend.sfm_types import (
     ViewReport,
 )
 from sceneexpander.frontend.tracks import Tracks, build_tracks
-from sceneexpander.frontend.twoview import PairMatches, fit_rotation, match_and_verify, relative_pose
+from sceneexpander.frontend.twoview import (
+    PairMatches,
+    fit_rotation,
+    fundamental_from_poses,
+    match_and_verify,
+    match_guided,
+    relative_pose,
+)
 
 __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "estimate_cameras"]
+
+_MIN_COMMON = 8  # points two views must share before their matches are worth finding again
 
 _log = logging.getLogger(__name__)
 
@@ -306,18 +315,15 @@ def _map(
         _set_known_poses(empty, known)
         return empty, focal.source or FocalSource.ASSUMED
     best = _on_all_tracks(best, tracks, focal, config, setup)
-    before = best.log_focal
     free = _free_views(best, known, config)
     best.grow(refine_focal=False, free=free)
-    refine = focal.refine and enough and int(best.registered.sum()) >= config.min_views_for_focal
-    if focal.source is not None:
-        refine = focal.refine
-    best.finish(refine_focal=refine, free=free)
-    if refine and best.focal_sigma > config.max_focal_sigma:
-        _log.info("focal is uncertain (sigma of its logarithm %.2f): kept at its start", best.focal_sigma)
-        best.log_focal = before
-        best.finish(refine_focal=False, free=free)
-        refine = False
+    refine = focal.refine and (focal.source is not None or int(best.registered.sum()) >= config.min_views_for_focal)
+    refine = _finish(best, refine, free, config)
+    if config.guided:
+        again = build_tracks(features, _guided_pairs(best, features, pairs, config))
+        best = _on_all_tracks(best, again, focal, config, setup)
+        best.grow(refine_focal=False, free=_free_views(best, known, config))
+        refine = _finish(best, refine, free, config)
     if refine:
         return best, FocalSource.REFINED
     return best, focal.source or FocalSource.SWEPT
@@ -334,6 +340,37 @@ def _new_mapping(
     mapping.log_focal_bounds = (min(np.log(low / ratio), 0.0), max(np.log(high / ratio), 0.0))
     mapping.log_focal_prior = (float(np.log(focal.prior / ratio)), focal.sigma)
     return mapping
+
+
+def _finish(mapping: Mapping, refine: bool, free: np.ndarray | None, config: SfmConfig) -> bool:
+    """Finish a model; a focal that turns out too uncertain goes back to where it was. Returns whether it was refined."""
+    before = mapping.log_focal
+    mapping.finish(refine_focal=refine, free=free)
+    if refine and mapping.focal_sigma > config.max_focal_sigma:
+        _log.info("focal is uncertain (sigma of its logarithm %.2f): kept at its start", mapping.focal_sigma)
+        mapping.log_focal = before
+        mapping.finish(refine_focal=False, free=free)
+        return False
+    return refine
+
+
+def _guided_pairs(
+    mapping: Mapping, features: list[Features], pairs: list[PairMatches], config: SfmConfig
+) -> list[PairMatches]:
+    """All pairs, those of registered views with motion between them matched again along the epipolar lines."""
+    found = []
+    intrinsics = mapping.intrinsics
+    for pair in pairs:
+        a, b = pair.view_a, pair.view_b
+        rotation = mapping.rotations[b] @ mapping.rotations[a].T
+        translation = mapping.translations[b] - rotation @ mapping.translations[a]
+        common = int((mapping.active[:, a] & mapping.active[:, b]).sum())
+        if not (mapping.registered[a] and mapping.registered[b]) or common < _MIN_COMMON:
+            found.append(pair)
+            continue
+        fundamental = fundamental_from_poses(rotation, translation, intrinsics[a], intrinsics[b])
+        found.append(match_guided(pair, features, fundamental, config, unit_px=mapping.unit_px))
+    return found
 
 
 def _on_all_tracks(model: Mapping, tracks: Tracks, focal: _FocalPlan, config: SfmConfig, setup: _Setup) -> Mapping:

@@ -28,7 +28,7 @@ class SfmConfig:
     equalise: bool = True  # local contrast equalisation (CLAHE) before detection
     match_ratio: float = 0.87  # nearest / second nearest distance, both directions, of mutual neighbours
     loose_match_ratio: float = 0.95  # the same for last-chance registration
-    guided: bool = True  # match again inside the epipolar band of verified pairs
+    guided: bool = True  # once cameras are known, match all pairs again inside their epipolar bands
     guided_band_px: float = 2.0
     guided_ratio: float = 0.85
     guided_max_distance: float = 0.7  # of unit descriptors
@@ -59,7 +59,9 @@ class SfmConfig:
     min_register_share: float = 0.25
     inlier_px: float = 3.0  # reprojection error of an observation that is kept in the end
     triangulate_px: float = 5.0  # the same while the model grows
-    robust_px: float = 1.0  # Cauchy scale in bundle adjustment
+    robust_px: float = 1.0  # Cauchy scale in bundle adjustment, at most; in the end it follows the errors
+    min_robust_px: float = 0.3
+    min_inlier_px: float = 1.2  # the final threshold follows the errors, too, between this and `inlier_px`
     loose_px: float = 8.0  # last-chance registration (views that match only roughly, such as generated ones)
     min_loose_inliers: int = 10
     bundle_iterations: int = 40

@@ -6,7 +6,7 @@ Robust fits are OpenCV's USAC with MAGSAC scoring, seeded explicitly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -77,23 +77,54 @@ def match_and_verify(
     verified = Matches.empty()
     fit = fit_fundamental(a.pixel_xy[strict.index_a], b.pixel_xy[strict.index_b], config, unit_px=unit_px, seed=seed)
     if fit is not None:
-        fundamental, inlier = fit
-        verified = strict.select(inlier)
-        if config.guided:
-            guided = guided_matches(
-                scores,
-                a,
-                b,
-                fundamental,
-                band_px=config.guided_band_px * unit_px,
-                max_ratio=config.guided_ratio,
-                max_distance=config.guided_max_distance,
-            )
-            verified = guided if guided.count >= verified.count else verified
+        verified = strict.select(fit[1])
     distinct = distinct_positions(a.pixel_xy[verified.index_a], b.pixel_xy[verified.index_b])
     return PairMatches(
         view_a=view_a, view_b=view_b, loose=loose, tentative=strict.count, verified=verified.select(distinct)
     )
+
+
+def match_guided(
+    pair: PairMatches,
+    features: list[Features],
+    fundamental: Float[np.ndarray, "3 3"],
+    config: SfmConfig,
+    *,
+    unit_px: float,
+) -> PairMatches:
+    """The same pair with its verified matches found again inside the epipolar band of a known geometry.
+
+    Args:
+        pair: as matched before.
+        features: of all views.
+        fundamental: x_b^T F x_a = 0 in pixels.
+        config: band, ratio, distance.
+        unit_px: as in `match_and_verify`.
+    """
+    a, b = features[pair.view_a], features[pair.view_b]
+    found = guided_matches(
+        similarity(a, b),
+        a,
+        b,
+        fundamental,
+        band_px=config.guided_band_px * unit_px,
+        max_ratio=config.guided_ratio,
+        max_distance=config.guided_max_distance,
+    )
+    distinct = distinct_positions(a.pixel_xy[found.index_a], b.pixel_xy[found.index_b])
+    return replace(pair, verified=found.select(distinct))
+
+
+def fundamental_from_poses(
+    rotation: Float[np.ndarray, "3 3"],
+    translation: Float[np.ndarray, " 3"],
+    intrinsics_a: Float[np.ndarray, "3 3"],
+    intrinsics_b: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "3 3"]:
+    """F with x_b^T F x_a = 0 of a calibrated motion ``b_from_a``."""
+    x, y, z = translation
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.linalg.inv(intrinsics_b).T @ cross @ rotation @ np.linalg.inv(intrinsics_a)
 
 
 def distinct_positions(xy_a: Float[np.ndarray, "match 2"], xy_b: Float[np.ndarray, "match 2"]) -> np.ndarray:
