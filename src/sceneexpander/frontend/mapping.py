@@ -22,6 +22,8 @@ from sceneexpander.frontend.twoview import (
 )
 
 _PRIOR_INFLATION = 8.0  # matching errors are correlated and partly systematic: that many of them count as one
+_NEIGHBOURS = 8
+_NEIGHBOUR_GAP = 0.2  # of the logarithm of depth: neighbours nearer than this agree
 
 
 class Mapping:
@@ -151,6 +153,30 @@ class Mapping:
         self.active = (errors < threshold_px * self.unit_px) & self.valid[:, None]
         self.valid &= self.active.sum(1) >= 2
         self.valid &= self.angles_deg() >= self.config.min_angle_deg
+        self.active &= self.valid[:, None]
+
+    def drop_strays(self) -> None:
+        """Drop points of only two views whose depth agrees with none of their neighbours in the image.
+
+        Two views cannot contradict a wrong match along an epipolar line; its surroundings can. Points at true depth edges
+        keep a neighbour on their own side.
+        """
+        from scipy.spatial import cKDTree
+
+        pairs_only = self.valid & ((self.active & self.registered).sum(1) == 2)
+        stray = np.zeros_like(self.valid)
+        for view in np.flatnonzero(self.registered):
+            rows = np.flatnonzero(self.valid & self.active[:, view])
+            if len(rows) <= _NEIGHBOURS:
+                continue
+            depth = self.points[rows] @ self.rotations[view][2] + self.translations[view][2]
+            pixel_xy = self.tracks.pixel_xy[rows, view]
+            _, near = cKDTree(pixel_xy).query(pixel_xy, k=_NEIGHBOURS + 1)
+            log_depth = np.log(np.maximum(depth, 1e-9))
+            gap = np.abs(log_depth[near[:, 1:]] - log_depth[:, None])
+            # One agreeing neighbour may be the same wrong match found twice.
+            stray[rows] |= (gap < _NEIGHBOUR_GAP).sum(1) < 2
+        self.valid &= ~(stray & pairs_only)
         self.active &= self.valid[:, None]
 
     def next_view(self, refused: set[int]) -> int | None:

@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.errors import UserError
-from sceneexpander.frontend.features import Features, detect_features, grey_u8
+from sceneexpander.frontend.features import Features, detect_features
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.placement import place_remaining, thumbnails_of
 from sceneexpander.frontend.sfm_report import build_reconstruction
+from sceneexpander.frontend.sfm_setup import FocalPlan, KnownCameras, Setup, known_cameras, prepare
 from sceneexpander.frontend.sfm_types import (
-    REFERENCE_LONG_SIDE_PX,
     FocalSource,
     PairKind,
     PairReport,
@@ -77,11 +75,11 @@ def estimate_cameras(
         UserError: known cameras that are no cameras.
         ValueError: tensors whose shapes do not agree.
     """
-    setup = _prepare(images, feature_images, config, generator, names)
-    known = _known_cameras(setup, known_intrinsics_px, known_world_from_cam)
+    setup = prepare(images, feature_images, config, generator, names)
+    known = known_cameras(setup, known_intrinsics_px, known_world_from_cam)
     features = [detect_features(grey, config) for grey in setup.greys]
     pairs = _all_pairs(features, config, setup)
-    focal = _FocalPlan.make(config, setup, known, focal_hint_px)
+    focal = FocalPlan.make(config, setup, known, focal_hint_px)
     kinds = _pair_kinds(features, pairs, focal.nominal, config, setup)
     mapping, source = _map(build_tracks(features, pairs), features, pairs, kinds, known, focal, config, setup)
     if not mapping.registered.any():
@@ -89,6 +87,7 @@ def estimate_cameras(
     placed = place_remaining(
         mapping, features, pairs, thumbnails_of(setup.greys), config, rng=np.random.default_rng(setup.seed)
     )
+    mapping.drop_strays()  # only now: rough registration can use points that the dense half had better not see
     pair_reports = tuple(
         PairReport(view_a=p.view_a, view_b=p.view_b, matches=p.tentative, inliers=p.verified.count, kind=kind)
         for p, kind in zip(pairs, kinds, strict=True)
@@ -96,154 +95,7 @@ def estimate_cameras(
     return build_reconstruction(mapping, placed, features, pair_reports, source, setup.names, setup.scale_xy)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Setup:
-    """Inputs in the form the steps need."""
-
-    greys: list[np.ndarray]
-    names: tuple[str, ...]
-    scale_xy: np.ndarray  # pixels of the given images per pixel of the feature images
-    unit_px: float
-    seed: int
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(height, width) of the feature images."""
-        height, width = self.greys[0].shape
-        return int(height), int(width)
-
-    @property
-    def long_side(self) -> int:
-        """Longer side of the feature images in pixels."""
-        return max(self.size)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Known:
-    """Given cameras, in feature pixels; ``posed`` marks the views whose pose was given."""
-
-    intrinsics: np.ndarray | None
-    cam_from_world: np.ndarray  # identity where unknown
-    posed: np.ndarray
-
-
-def _prepare(
-    images: Tensor,
-    feature_images: Tensor | None,
-    config: SfmConfig,
-    generator: torch.Generator,
-    names: Sequence[str] | None,
-) -> _Setup:
-    """Check shapes, make grey images and draw the seed."""
-    if images.ndim != 4 or images.shape[1] != 3 or images.shape[0] < 1:
-        raise ValueError(f"images must be (view, 3, height, width) with at least one view, are {tuple(images.shape)}")
-    source = images if feature_images is None else feature_images
-    if source.ndim != 4 or source.shape[:2] != images.shape[:2]:
-        raise ValueError(f"feature_images {tuple(source.shape)} do not belong to images {tuple(images.shape)}")
-    labels = tuple(f"view {i}" for i in range(images.shape[0])) if names is None else tuple(names)
-    if len(labels) != images.shape[0]:
-        raise ValueError(f"{len(labels)} names for {images.shape[0]} views")
-    height, width = source.shape[2:]
-    # Always one draw, so that the caller's stream does not depend on what was found.
-    seed = int(torch.randint(0, 2**30, (1,), generator=generator).item())
-    return _Setup(
-        greys=[grey_u8(image) for image in source.detach().cpu().numpy()],
-        names=labels,
-        scale_xy=np.array([images.shape[3] / width, images.shape[2] / height]),
-        unit_px=max(height, width) / REFERENCE_LONG_SIDE_PX,
-        seed=seed,
-    )
-
-
-def _known_cameras(setup: _Setup, intrinsics_px: Tensor | None, world_from_cam: Tensor | None) -> _Known:
-    """Validate given cameras and bring them to feature pixels and ``cam_from_world``."""
-    views = len(setup.greys)
-    intrinsics = None
-    if intrinsics_px is not None:
-        intrinsics = intrinsics_px.detach().cpu().numpy().astype(np.float64)
-        if intrinsics.shape != (views, 3, 3):
-            raise ValueError(f"known_intrinsics_px must be ({views}, 3, 3), is {intrinsics.shape}")
-        if not np.isfinite(intrinsics).all() or (intrinsics[:, [0, 1], [0, 1]] <= 0).any():
-            raise UserError(
-                "holds a focal length that is not positive", where="known intrinsics", fix="give pixels > 0"
-            )
-        intrinsics = intrinsics * np.array([1 / setup.scale_xy[0], 1 / setup.scale_xy[1], 1.0])[:, None]
-    cam_from_world = np.tile(np.eye(4), (views, 1, 1))
-    posed = np.zeros(views, bool)
-    if world_from_cam is not None:
-        given = world_from_cam.detach().cpu().numpy().astype(np.float64)
-        if given.shape != (views, 4, 4):
-            raise ValueError(f"known_world_from_cam must be ({views}, 4, 4), is {given.shape}")
-        posed = np.asarray(np.isfinite(given).all((1, 2)))
-        for view in np.flatnonzero(posed):
-            rotation = given[view, :3, :3]
-            if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
-                raise UserError(
-                    "is not a rigid pose",
-                    where=f"known pose of {setup.names[view]}",
-                    fix="give camera-to-world, OpenCV axes",
-                )
-            u, _, vt = np.linalg.svd(rotation)  # poses from text files are orthogonal to a few digits only
-            cam_from_world[view, :3, :3] = (u @ vt).T
-            cam_from_world[view, :3, 3] = -(u @ vt).T @ given[view, :3, 3]
-    return _Known(intrinsics=intrinsics, cam_from_world=cam_from_world, posed=posed)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _FocalPlan:
-    """Start intrinsics to try, and how tightly the focal is tied to its prior."""
-
-    starts: tuple[np.ndarray, ...]  # each (view, 3, 3)
-    nominal: np.ndarray  # (view, 3, 3): for decisions that any plausible focal serves
-    prior: float  # focal over long side
-    sigma: float
-    source: FocalSource | None  # set when nothing is to be estimated or hinted
-    refine: bool
-
-    @classmethod
-    def make(cls, config: SfmConfig, setup: _Setup, known: _Known, focal_hint_px: float | None) -> _FocalPlan:
-        """Known intrinsics, else the hint, else the sweep."""
-        views = len(setup.greys)
-        if known.intrinsics is not None:
-            ratio = float(known.intrinsics[0, 0, 0]) / setup.long_side
-            return cls(
-                starts=(known.intrinsics,),
-                nominal=known.intrinsics,
-                prior=ratio,
-                sigma=config.focal_hint_sigma,
-                source=FocalSource.KNOWN,
-                refine=config.refine_known_intrinsics,
-            )
-
-        def intrinsics(ratio: float) -> np.ndarray:
-            height, width = setup.size
-            focal = ratio * setup.long_side
-            return np.tile(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), (views, 1, 1))
-
-        if focal_hint_px is not None:
-            if not np.isfinite(focal_hint_px) or focal_hint_px <= 0:
-                raise UserError(f"is {focal_hint_px}", where="focal hint", fix="give pixels > 0, or none")
-            ratio = focal_hint_px / float(setup.scale_xy[0]) / setup.long_side
-            start = intrinsics(ratio)
-            return cls(
-                starts=(start,),
-                nominal=start,
-                prior=ratio,
-                sigma=config.focal_hint_sigma,
-                source=FocalSource.HINT,
-                refine=True,
-            )
-        return cls(
-            starts=tuple(intrinsics(ratio) for ratio in config.focal_starts),
-            nominal=intrinsics(config.focal_prior),
-            prior=config.focal_prior,
-            sigma=config.focal_prior_sigma,
-            source=None,
-            refine=True,
-        )
-
-
-def _all_pairs(features: list[Features], config: SfmConfig, setup: _Setup) -> list[PairMatches]:
+def _all_pairs(features: list[Features], config: SfmConfig, setup: Setup) -> list[PairMatches]:
     """Matches of every pair of views."""
     views = len(features)
     return [
@@ -254,7 +106,7 @@ def _all_pairs(features: list[Features], config: SfmConfig, setup: _Setup) -> li
 
 
 def _pair_kinds(
-    features: list[Features], pairs: list[PairMatches], intrinsics: np.ndarray, config: SfmConfig, setup: _Setup
+    features: list[Features], pairs: list[PairMatches], intrinsics: np.ndarray, config: SfmConfig, setup: Setup
 ) -> list[PairKind]:
     """Which pairs have parallax. The focal hardly matters for that question."""
     kinds = []
@@ -282,10 +134,10 @@ def _map(
     features: list[Features],
     pairs: list[PairMatches],
     kinds: list[PairKind],
-    known: _Known,
-    focal: _FocalPlan,
+    known: KnownCameras,
+    focal: FocalPlan,
     config: SfmConfig,
-    setup: _Setup,
+    setup: Setup,
 ) -> tuple[Mapping, FocalSource]:
     """The best model over all focal starts and initial pairs, finished; and where its focal came from."""
     enough = len(setup.greys) >= config.min_views_for_focal or focal.source is not None
@@ -318,6 +170,7 @@ def _map(
     free = _free_views(best, known, config)
     best.grow(refine_focal=False, free=free)
     refine = focal.refine and (focal.source is not None or int(best.registered.sum()) >= config.min_views_for_focal)
+    attempted = refine
     refine = _finish(best, refine, free, config)
     if config.guided:
         again = build_tracks(features, _guided_pairs(best, features, pairs, config))
@@ -326,12 +179,10 @@ def _map(
         refine = _finish(best, refine, free, config)
     if refine:
         return best, FocalSource.REFINED
-    return best, focal.source or FocalSource.SWEPT
+    return best, focal.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)
 
 
-def _new_mapping(
-    tracks: Tracks, intrinsics: np.ndarray, focal: _FocalPlan, config: SfmConfig, setup: _Setup
-) -> Mapping:
+def _new_mapping(tracks: Tracks, intrinsics: np.ndarray, focal: FocalPlan, config: SfmConfig, setup: Setup) -> Mapping:
     """An empty model with start intrinsics, bounds and prior of the focal relative to them."""
     mapping = Mapping(tracks, intrinsics, config, unit_px=setup.unit_px, seed=setup.seed)
     ratio = float(intrinsics[0, 0, 0]) / setup.long_side
@@ -343,12 +194,11 @@ def _new_mapping(
 
 
 def _finish(mapping: Mapping, refine: bool, free: np.ndarray | None, config: SfmConfig) -> bool:
-    """Finish a model; a focal that turns out too uncertain goes back to where it was. Returns whether it was refined."""
-    before = mapping.log_focal
+    """Finish a model; a focal that turns out too uncertain falls back to its prior. Returns whether it was refined."""
     mapping.finish(refine_focal=refine, free=free)
     if refine and mapping.focal_sigma > config.max_focal_sigma:
-        _log.info("focal is uncertain (sigma of its logarithm %.2f): kept at its start", mapping.focal_sigma)
-        mapping.log_focal = before
+        _log.info("focal is uncertain (sigma of its logarithm %.2f): the prior is kept", mapping.focal_sigma)
+        mapping.log_focal = mapping.log_focal_prior[0]
         mapping.finish(refine_focal=False, free=free)
         return False
     return refine
@@ -373,21 +223,21 @@ def _guided_pairs(
     return found
 
 
-def _on_all_tracks(model: Mapping, tracks: Tracks, focal: _FocalPlan, config: SfmConfig, setup: _Setup) -> Mapping:
+def _on_all_tracks(model: Mapping, tracks: Tracks, focal: FocalPlan, config: SfmConfig, setup: Setup) -> Mapping:
     """The same cameras over all tracks."""
     full = _new_mapping(tracks, model.start_intrinsics, focal, config, setup)
     full.adopt(model)
     return full
 
 
-def _set_known_poses(mapping: Mapping, known: _Known) -> None:
+def _set_known_poses(mapping: Mapping, known: KnownCameras) -> None:
     """Register the views whose pose was given."""
     mapping.rotations[:] = known.cam_from_world[:, :3, :3]
     mapping.translations[:] = known.cam_from_world[:, :3, 3]
     mapping.registered = known.posed.copy()
 
 
-def _free_views(mapping: Mapping, known: _Known, config: SfmConfig) -> Bool[np.ndarray, " view"] | None:
+def _free_views(mapping: Mapping, known: KnownCameras, config: SfmConfig) -> Bool[np.ndarray, " view"] | None:
     """Cameras that adjustment may move; None leaves the choice of the reference to the mapping."""
     if not known.posed.any():
         return None
@@ -404,7 +254,7 @@ def _initial_pairs(
     kinds: list[PairKind],
     intrinsics: np.ndarray,
     config: SfmConfig,
-    setup: _Setup,
+    setup: Setup,
 ) -> list[PairMatches | None]:
     """The most promising pairs to begin with: inliers x triangulation angle, capped."""
     scored: list[tuple[float, PairMatches]] = []

@@ -126,9 +126,7 @@ def _notes(mapping: Mapping, source: FocalSource) -> tuple[str, ...]:
     if not mapping.valid.any():
         notes.append("no point could be triangulated: the views share no matches with parallax")
     if source is FocalSource.SWEPT:
-        notes.append(
-            "the focal is the best of a few plausible values: too few views or too little evidence to refine it"
-        )
+        notes.append("the focal is the best of a few plausible values: too few views to refine it")
     if source is FocalSource.ASSUMED:
-        notes.append("the focal is assumed: nothing to estimate it from")
+        notes.append("the focal is assumed: there is too little parallax to estimate it from")
     return tuple(notes)

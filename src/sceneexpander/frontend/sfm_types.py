@@ -50,7 +50,7 @@ class SfmConfig:
     focal_prior_sigma: float = 0.25  # of the logarithm
     focal_hint_sigma: float = 0.05  # of the logarithm, around a focal from EXIF
     min_views_for_focal: int = 4  # with fewer views the focal is chosen among the starts and then fixed
-    max_focal_sigma: float = 0.15  # of the logarithm: a focal less certain than this is fixed at its start
+    max_focal_sigma: float = 0.15  # of the logarithm: a focal less certain than this is fixed at its prior
 
     # Reconstruction.
     initial_pairs: int = 2  # tried per focal start
@@ -99,8 +99,8 @@ class FocalSource(StrEnum):
     KNOWN = "known"  # given intrinsics, kept
     REFINED = "refined"  # bundle adjustment
     HINT = "hint"  # given focal, kept
-    SWEPT = "swept"  # the best of the starts, kept because too few views or too little evidence refine it
-    ASSUMED = "assumed"  # nothing to estimate it from: the prior
+    SWEPT = "swept"  # the best of the starts, kept because there are too few views to refine it
+    ASSUMED = "assumed"  # nothing, or too little, to estimate it from: the prior
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

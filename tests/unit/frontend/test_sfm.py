@@ -305,3 +305,25 @@ def test_bad_arguments_are_refused(scene: scenes.Scene) -> None:
         SfmConfig(focal_bounds=(1.0, 0.5))
     with pytest.raises(ValueError, match="focal_starts"):
         SfmConfig(focal_starts=(3.0,))
+
+
+def test_a_wrong_match_that_only_two_views_see_is_dropped_before_export() -> None:
+    world = worlds.point_world(30, views=2, points=300)
+    rng = np.random.default_rng(2)
+    # A slanted plane, so that neighbours in the image agree; some points slid far along their viewing ray.
+    points = world.points.copy()
+    points[:, 2] = 5 + 0.3 * points[:, 0]
+    strays = rng.choice(300, 12, replace=False)
+    points[strays] *= rng.choice([0.5, 2.0], 12)[:, None]
+    mapping = Mapping(world.tracks, world.intrinsics, SfmConfig(), unit_px=1.0, seed=1)
+    mapping.rotations, mapping.translations = world.rotations, world.translations
+    mapping.registered[:] = True
+    mapping.points = points
+    seen = np.einsum("vij,pj->pvi", world.rotations, points) + world.translations
+    pixels = np.einsum("vij,pvj->pvi", world.intrinsics, seen)
+    mapping.tracks = Tracks(pixel_xy=pixels[..., :2] / pixels[..., 2:], seen=np.ones((300, 2), bool))
+    mapping.valid[:] = True
+    mapping.active[:] = True
+    mapping.drop_strays()
+    assert not mapping.valid[strays].any()
+    assert mapping.valid.sum() > 280

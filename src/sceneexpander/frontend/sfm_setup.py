@@ -1,0 +1,161 @@
+"""What the sparse front-end is given, checked and in the form its steps need: grey images, known cameras, focals to try."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sceneexpander.errors import UserError
+from sceneexpander.frontend.features import grey_u8
+from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, FocalSource, SfmConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setup:
+    """Inputs in the form the steps need."""
+
+    greys: list[np.ndarray]
+    names: tuple[str, ...]
+    scale_xy: np.ndarray  # pixels of the given images per pixel of the feature images
+    unit_px: float
+    seed: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the feature images."""
+        height, width = self.greys[0].shape
+        return int(height), int(width)
+
+    @property
+    def long_side(self) -> int:
+        """Longer side of the feature images in pixels."""
+        return max(self.size)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownCameras:
+    """Given cameras, in feature pixels; ``posed`` marks the views whose pose was given."""
+
+    intrinsics: np.ndarray | None
+    cam_from_world: np.ndarray  # identity where unknown
+    posed: np.ndarray
+
+
+def prepare(
+    images: Tensor,
+    feature_images: Tensor | None,
+    config: SfmConfig,
+    generator: torch.Generator,
+    names: Sequence[str] | None,
+) -> Setup:
+    """Check shapes, make grey images and draw the seed."""
+    if images.ndim != 4 or images.shape[1] != 3 or images.shape[0] < 1:
+        raise ValueError(f"images must be (view, 3, height, width) with at least one view, are {tuple(images.shape)}")
+    source = images if feature_images is None else feature_images
+    if source.ndim != 4 or source.shape[:2] != images.shape[:2]:
+        raise ValueError(f"feature_images {tuple(source.shape)} do not belong to images {tuple(images.shape)}")
+    labels = tuple(f"view {i}" for i in range(images.shape[0])) if names is None else tuple(names)
+    if len(labels) != images.shape[0]:
+        raise ValueError(f"{len(labels)} names for {images.shape[0]} views")
+    height, width = source.shape[2:]
+    # Always one draw, so that the caller's stream does not depend on what was found.
+    seed = int(torch.randint(0, 2**30, (1,), generator=generator).item())
+    return Setup(
+        greys=[grey_u8(image) for image in source.detach().cpu().numpy()],
+        names=labels,
+        scale_xy=np.array([images.shape[3] / width, images.shape[2] / height]),
+        unit_px=max(height, width) / REFERENCE_LONG_SIDE_PX,
+        seed=seed,
+    )
+
+
+def known_cameras(setup: Setup, intrinsics_px: Tensor | None, world_from_cam: Tensor | None) -> KnownCameras:
+    """Validate given cameras and bring them to feature pixels and ``cam_from_world``."""
+    views = len(setup.greys)
+    intrinsics = None
+    if intrinsics_px is not None:
+        intrinsics = intrinsics_px.detach().cpu().numpy().astype(np.float64)
+        if intrinsics.shape != (views, 3, 3):
+            raise ValueError(f"known_intrinsics_px must be ({views}, 3, 3), is {intrinsics.shape}")
+        if not np.isfinite(intrinsics).all() or (intrinsics[:, [0, 1], [0, 1]] <= 0).any():
+            raise UserError(
+                "holds a focal length that is not positive", where="known intrinsics", fix="give pixels > 0"
+            )
+        intrinsics = intrinsics * np.array([1 / setup.scale_xy[0], 1 / setup.scale_xy[1], 1.0])[:, None]
+    cam_from_world = np.tile(np.eye(4), (views, 1, 1))
+    posed = np.zeros(views, bool)
+    if world_from_cam is not None:
+        given = world_from_cam.detach().cpu().numpy().astype(np.float64)
+        if given.shape != (views, 4, 4):
+            raise ValueError(f"known_world_from_cam must be ({views}, 4, 4), is {given.shape}")
+        posed = np.asarray(np.isfinite(given).all((1, 2)))
+        for view in np.flatnonzero(posed):
+            rotation = given[view, :3, :3]
+            if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
+                raise UserError(
+                    "is not a rigid pose",
+                    where=f"known pose of {setup.names[view]}",
+                    fix="give camera-to-world, OpenCV axes",
+                )
+            u, _, vt = np.linalg.svd(rotation)  # poses from text files are orthogonal to a few digits only
+            cam_from_world[view, :3, :3] = (u @ vt).T
+            cam_from_world[view, :3, 3] = -(u @ vt).T @ given[view, :3, 3]
+    return KnownCameras(intrinsics=intrinsics, cam_from_world=cam_from_world, posed=posed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FocalPlan:
+    """Start intrinsics to try, and how tightly the focal is tied to its prior."""
+
+    starts: tuple[np.ndarray, ...]  # each (view, 3, 3)
+    nominal: np.ndarray  # (view, 3, 3): for decisions that any plausible focal serves
+    prior: float  # focal over long side
+    sigma: float
+    source: FocalSource | None  # set when nothing is to be estimated or hinted
+    refine: bool
+
+    @classmethod
+    def make(cls, config: SfmConfig, setup: Setup, known: KnownCameras, focal_hint_px: float | None) -> FocalPlan:
+        """Known intrinsics, else the hint, else the sweep."""
+        views = len(setup.greys)
+        if known.intrinsics is not None:
+            ratio = float(known.intrinsics[0, 0, 0]) / setup.long_side
+            return cls(
+                starts=(known.intrinsics,),
+                nominal=known.intrinsics,
+                prior=ratio,
+                sigma=config.focal_hint_sigma,
+                source=FocalSource.KNOWN,
+                refine=config.refine_known_intrinsics,
+            )
+
+        def intrinsics(ratio: float) -> np.ndarray:
+            height, width = setup.size
+            focal = ratio * setup.long_side
+            return np.tile(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), (views, 1, 1))
+
+        if focal_hint_px is not None:
+            if not np.isfinite(focal_hint_px) or focal_hint_px <= 0:
+                raise UserError(f"is {focal_hint_px}", where="focal hint", fix="give pixels > 0, or none")
+            ratio = focal_hint_px / float(setup.scale_xy[0]) / setup.long_side
+            start = intrinsics(ratio)
+            return cls(
+                starts=(start,),
+                nominal=start,
+                prior=ratio,
+                sigma=config.focal_hint_sigma,
+                source=FocalSource.HINT,
+                refine=True,
+            )
+        return cls(
+            starts=tuple(intrinsics(ratio) for ratio in config.focal_starts),
+            nominal=intrinsics(config.focal_prior),
+            prior=config.focal_prior,
+            sigma=config.focal_prior_sigma,
+            source=None,
+            refine=True,
+        )
