@@ -123,9 +123,9 @@ def pictures_in(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
 
 
-def synthetic_rows(scenes: int, views: int, config: SfmConfig) -> Iterable[Row]:
+def synthetic_rows(seeds: Iterable[int], views: int, config: SfmConfig) -> Iterable[Row]:
     """Held-out procedural scenes at 768 x 576."""
-    for seed in range(scenes):
+    for seed in seeds:
         made = make_views(seed, views=views, height=576, width=768, split="test", supersample=1.0)
         yield measure(f"synthetic {seed}", made.images, config, made.world_from_cam, made.intrinsics_px)
 
@@ -186,6 +186,7 @@ def main() -> None:
     """Parse arguments, measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--posed", type=Path)
     parser.add_argument("--photos", type=Path, nargs="*", default=[])
@@ -206,7 +207,8 @@ def main() -> None:
             summaries[title] = summary(title, group)
 
     if arguments.scenes:
-        run("synthetic", synthetic_rows(arguments.scenes, arguments.views, config))
+        seeds = range(arguments.first_seed, arguments.first_seed + arguments.scenes)
+        run("synthetic", synthetic_rows(seeds, arguments.views, config))
     if arguments.posed:
         run("posed", posed_rows(arguments.posed, config))
     for folder in arguments.photos:

@@ -29,9 +29,6 @@ class SfmConfig:
     match_ratio: float = 0.87  # nearest / second nearest distance, both directions, of mutual neighbours
     loose_match_ratio: float = 0.95  # the same for last-chance registration
     guided: bool = True  # once cameras are known, match all pairs again inside their epipolar bands
-    guided_below: int = (
-        80  # pairs with fewer verified matches are matched again at once, along their fundamental matrix
-    )
     guided_band_px: float = 2.0
     guided_ratio: float = 0.85
     guided_max_distance: float = 0.7  # of unit descriptors

@@ -79,13 +79,9 @@ def match_and_verify(
     if fit is not None:
         verified = strict.select(fit[1])
     distinct = distinct_positions(a.pixel_xy[verified.index_a], b.pixel_xy[verified.index_b])
-    pair = PairMatches(
+    return PairMatches(
         view_a=view_a, view_b=view_b, loose=loose, tentative=strict.count, verified=verified.select(distinct)
     )
-    if config.guided and fit is not None and pair.verified.count < config.guided_below:
-        guided = match_guided(pair, features, fit[0], config, unit_px=unit_px)
-        pair = guided if guided.verified.count > pair.verified.count else pair
-    return pair
 
 
 def match_guided(
