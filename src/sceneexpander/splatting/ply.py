@@ -3,7 +3,7 @@
 The layout is the usual one of 3D Gaussian splatting: position ``x y z``, unused normals ``nx ny nz``, spherical harmonics
 ``f_dc_*`` and ``f_rest_*`` (channel by channel), ``opacity`` as a logit, ``scale_*`` as natural logarithms, ``rot_*`` as a
 scalar-first quaternion; float32, binary little-endian. Provenance follows in two properties that other programs skip:
-``source_view`` (int, -1 unknown) and ``generated`` (uchar).
+``source_view`` (-1 unknown) and ``generated`` (0 or 1). They are float32 too: some readers take rows for arrays of floats.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from torch import Tensor
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.splatting.files import complete_file
+from sceneexpander.splatting.scene import check_finite
 
 ROWS_PER_CHUNK = 65536  # written at once, bounds the memory
 OPACITY_MARGIN = 1e-6  # logits of exactly 0 or 1 would be infinite, which viewers do not expect
@@ -33,6 +34,7 @@ SCALAR_TYPES = {
 }  # fmt: skip
 FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+PROVENANCE = ("source_view", "generated")
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
@@ -45,16 +47,12 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     if rest not in REST_COUNTS:
         raise ValueError(f"sh has {gaussians.sh.shape[1]} coefficients, a PLY holds degrees 0 to 3")
     for name in ("means", "quat_wxyz", "scales", "opacities", "sh"):
-        value = getattr(gaussians, name)
-        if not bool(torch.isfinite(value).all()):
-            row = int((~torch.isfinite(value)).reshape(len(value), -1).any(-1).nonzero()[0, 0])
-            raise ValueError(f"{name} row {row} is not finite")
+        check_finite(name, getattr(gaussians, name))
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(rest)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", *ROTATION]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
-    header += [f"property float {name}" for name in names]
-    header += ["property int source_view", "property uchar generated", "end_header"]
+    header += [*(f"property float {name}" for name in (*names, *PROVENANCE)), "end_header"]
     with complete_file(path) as scratch, scratch.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         scene = gaussians.detach()
@@ -72,14 +70,11 @@ def _write_rows(file: BinaryIO, scene: Gaussians, rows: slice) -> None:
         torch.logit(scene.opacities[rows].double(), eps=OPACITY_MARGIN)[:, None],
         scene.scales[rows].clamp(min=SMALLEST_SCALE).log(),
         torch.nn.functional.normalize(scene.quat_wxyz[rows], dim=-1),
+        scene.source_view[rows, None],
+        scene.generated[rows, None],
     ]
     floats = torch.cat([c.float().cpu() for c in columns], 1).numpy().astype("<f4", copy=False)
-    width = 4 * floats.shape[1]
-    table = np.empty((len(floats), width + 5), np.uint8)
-    table[:, :width] = floats.view(np.uint8)
-    table[:, width : width + 4] = scene.source_view[rows].cpu().numpy().astype("<i4")[:, None].view(np.uint8)
-    table[:, width + 4] = scene.generated[rows].cpu().numpy()
-    file.write(table.data)
+    file.write(floats.data)
 
 
 def read_ply(path: Path) -> Gaussians:

@@ -43,7 +43,7 @@ class RasterScene:
                 raise ValueError(
                     f"{name} is {value.dtype} on {value.device}, means are {self.means.dtype} on {self.means.device}"
                 )
-            _check_finite(name, value)
+            check_finite(name, value)
         self._check_values()
 
     @property
@@ -129,7 +129,7 @@ class RasterScene:
             _refuse_rows("cam_from_world", self.cam_from_world, wrong, "has a bottom row other than 0 0 0 1")
 
 
-def _check_finite(name: str, value: Tensor) -> None:
+def check_finite(name: str, value: Tensor) -> None:
     with torch.no_grad():
         # One cheap pass: a sum over NaN or inf is never finite. A sum may overflow by itself, hence the exact second look.
         if bool(torch.isfinite(value.sum())):
