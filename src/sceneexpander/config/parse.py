@@ -98,14 +98,19 @@ def _parse_union(options: tuple[Any, ...], value: object, where: str) -> Any:
     if value is None and types.NoneType in options:
         return None
     errors = []
-    for option in options:
-        if option is types.NoneType:
-            continue
+    for option in sorted((o for o in options if o is not types.NoneType), key=lambda o: -_shared_keys(o, value)):
         try:
             return parse_value(option, value, where=where)
         except ConfigError as error:
             errors.append(error)
     raise errors[0]
+
+
+def _shared_keys(option: Any, value: object) -> int:
+    """How many of a section's keys a type has: the one with most is what was meant, and its complaint is the useful one."""
+    if not dataclasses.is_dataclass(option) or not isinstance(value, Mapping):
+        return 0
+    return len({f.name for f in dataclasses.fields(option)} & set(value))
 
 
 def _parse_choice(choices: tuple[Any, ...], value: object, where: str) -> Any:

@@ -99,26 +99,26 @@ def shortest_path_order(world_from_cam: Float[Tensor, "camera 4 4"], *, last: in
 
 
 def orbit(
+    world_from_cam: Float[Tensor, "4 4"],
     target: Float[Tensor, "3"],
-    radius: float,
     frames: int,
     *,
     up: Float[Tensor, "3"],
-    elevation_rad: float = 0.3,
-    start_rad: float = 0.0,
+    turn_rad: float = 2 * math.pi,
 ) -> Float[Tensor, "frame 4 4"]:
-    """One closed turn around ``target``, looking at it, from ``elevation_rad`` above; the first pose is not repeated at the end."""
-    if radius <= 0 or frames < 1 or abs(elevation_rad) >= math.pi / 2:
-        raise ValueError(f"orbit with radius {radius}, {frames} frames, elevation {elevation_rad} rad")
-    axis = torch.nn.functional.normalize(up, dim=0)
-    helper = torch.zeros_like(axis)
-    helper[int(axis.abs().argmin())] = 1
-    across = torch.nn.functional.normalize(torch.linalg.cross(axis, helper), dim=0)
-    along = torch.linalg.cross(axis, across)
-    angle = start_rad + torch.arange(frames, dtype=axis.dtype, device=axis.device) * (2 * math.pi / frames)
-    ring = torch.cos(angle)[:, None] * across + torch.sin(angle)[:, None] * along
-    eye = target + radius * (math.cos(elevation_rad) * ring + math.sin(elevation_rad) * axis)
-    return look_at(eye, target.expand_as(eye), axis)
+    """One camera carried around the axis ``up`` through ``target``; the first frame is the camera itself.
+
+    A whole turn closes without repeating its first pose; less than one is a swing of half of it to either side and back.
+    """
+    if frames < 1 or not 0 < turn_rad <= 2 * math.pi or not bool(up.any()):
+        raise ValueError(f"orbit with {frames} frames, a turn of {turn_rad} rad, up {up.tolist()}")
+    share = torch.arange(frames, dtype=torch.float64, device=up.device) / frames
+    angle = 2 * math.pi * share
+    if turn_rad < 2 * math.pi:
+        angle = turn_rad / 2 * torch.sin(angle)
+    turn = _rotation(torch.nn.functional.normalize(up.double(), dim=0) * angle[:, None])
+    centre = target.double() + turn @ (world_from_cam[:3, 3].double() - target.double())
+    return rigid_from_parts(turn @ world_from_cam[:3, :3].double(), centre).to(world_from_cam)
 
 
 def spiral(
@@ -138,6 +138,22 @@ def spiral(
     eye = centre + offset @ rotation.T
     target = (centre + rotation[:, 2] * focus_depth).expand_as(eye)
     return look_at(eye, target, -rotation[:, 1])
+
+
+def mean_up(world_from_cam: Float[Tensor, "camera 4 4"]) -> Float[Tensor, "3"]:
+    """Where up is, as a unit vector of the world frame: people hold cameras upright, so the mean of what is up in them.
+
+    Cameras that look up and down on opposite sides may cancel: then the first one decides.
+    """
+    mean = -world_from_cam[:, :3, 1].mean(0)
+    return torch.nn.functional.normalize(mean if float(mean.norm()) > 0.2 else -world_from_cam[0, :3, 1], dim=0)
+
+
+def focus_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view"]:
+    """What one turns around: the median z-depth of the middle half of each view."""
+    height, width = depth.shape[1:]
+    middle = depth[:, height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return middle.flatten(1).median(1).values
 
 
 def _key_times(poses: Float[Tensor, "key 4 4"], frames: int) -> Float[Tensor, "key"]:

@@ -1,6 +1,7 @@
 """Reconstructions as videos and pictures."""
 
-from sceneexpander.rendering.config import RenderConfig
-from sceneexpander.rendering.produce import plan_tour, produce_renders
+from sceneexpander.rendering.config import EyeKey, RenderConfig, ViewKey
+from sceneexpander.rendering.produce import produce_renders
+from sceneexpander.rendering.tour import plan_tour
 
-__all__ = ["RenderConfig", "plan_tour", "produce_renders"]
+__all__ = ["EyeKey", "RenderConfig", "ViewKey", "plan_tour", "produce_renders"]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -19,6 +21,73 @@ GENERATED_TINT = (1.0, 0.45, 0.05)
 SMALLEST_SPREAD = 1e-6  # relative, of depths that still get more than one colour
 
 
+class VideoEncoder:
+    """Takes the frames of one video; made by `open_video`."""
+
+    def __init__(self, container: Any, fps: float, crf: int) -> None:
+        self._container = container
+        self._stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+        self._crf = crf
+        self._shape: torch.Size | None = None
+        self.count = 0
+
+    def add(self, frame: Float[Tensor, "3 height width"] | UInt8[Tensor, "3 height width"]) -> None:
+        """Encode the next frame. Floats are RGB in [0, 1] and are clamped; odd sizes are padded by their last row or column.
+
+        Raises:
+            ValueError: another shape or dtype than the first one, or values that are not finite; names its index.
+        """
+        import av
+
+        pixels = _to_bytes(frame, self.count)
+        if self._shape is None:
+            self._shape = pixels.shape
+            self._set_up(*pixels.shape[:2])
+        if pixels.shape != self._shape:
+            raise ValueError(f"frame {self.count} is {tuple(pixels.shape)}, the first one was {tuple(self._shape)}")
+        picture = av.VideoFrame.from_ndarray(pixels.numpy(), format="rgb24")
+        picture = picture.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
+        self._container.mux(self._stream.encode(picture))
+        self.count += 1
+
+    def finish(self) -> None:
+        """Write what the encoder still holds. Raises `ValueError` if there was no frame."""
+        if self.count == 0:
+            raise ValueError("a video needs at least one frame")
+        self._container.mux(self._stream.encode())
+
+    def _set_up(self, height: int, width: int) -> None:
+        stream = self._stream
+        stream.height, stream.width = height, width
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": str(self._crf), "preset": "medium"}
+        context = stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = BT709
+        context.color_range = LIMITED_RANGE
+
+
+@contextlib.contextmanager
+def open_video(path: Path, fps: float, *, crf: int = 18) -> Iterator[VideoEncoder]:
+    """An H.264 file (yuv420p, BT.709, faststart MP4) that takes frames as they come.
+
+    It appears at the end of the context, complete; after an error nothing is left behind, and an older file stays.
+
+    Args:
+        path: of the MP4.
+        fps: frames per second.
+        crf: constant quality of the encoder, 0 (lossless) to 51; 18 looks like the original.
+    """
+    import av
+
+    if fps <= 0:
+        raise ValueError(f"fps must be > 0, got {fps}")
+    options = {"movflags": "+faststart"}
+    with complete_file(path) as scratch, av.open(str(scratch), "w", format="mp4", options=options) as container:
+        encoder = VideoEncoder(container, fps, crf)
+        yield encoder
+        encoder.finish()
+
+
 def write_video(
     frames: Iterable[Float[Tensor, "3 height width"] | UInt8[Tensor, "3 height width"]],
     path: Path,
@@ -26,48 +95,11 @@ def write_video(
     *,
     crf: int = 18,
 ) -> int:
-    """Encode frames as they come (H.264, yuv420p, BT.709, faststart MP4) and return how many there were.
-
-    Floats are RGB in [0, 1] and are clamped. Odd sizes are padded by repeating the last row or column. The file appears only when
-    complete; on an error nothing is left behind.
-
-    Args:
-        crf: constant quality of the encoder, 0 (lossless) to 51; 18 looks like the original.
-
-    Raises:
-        ValueError: no frames, a frame of another shape or dtype than the first, or one that is not finite; names its index.
-    """
-    import av
-
-    if fps <= 0:
-        raise ValueError(f"fps must be > 0, got {fps}")
-    count = 0
-    shape: torch.Size | None = None
-    with (
-        complete_file(path) as scratch,
-        av.open(str(scratch), "w", format="mp4", options={"movflags": "+faststart"}) as container,
-    ):
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+    """Encode all frames (see `open_video`) and return how many there were."""
+    with open_video(path, fps, crf=crf) as video:
         for frame in frames:
-            pixels = _to_bytes(frame, count)
-            shape = pixels.shape if shape is None else shape
-            if pixels.shape != shape:
-                raise ValueError(f"frame {count} is {tuple(pixels.shape)}, the first one was {tuple(shape)}")
-            if count == 0:
-                stream.height, stream.width = shape[0], shape[1]
-                stream.pix_fmt = "yuv420p"
-                stream.options = {"crf": str(crf), "preset": "medium"}
-                context = stream.codec_context
-                context.colorspace = context.color_primaries = context.color_trc = BT709
-                context.color_range = LIMITED_RANGE
-            picture = av.VideoFrame.from_ndarray(pixels.numpy(), format="rgb24")
-            picture = picture.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
-            container.mux(stream.encode(picture))
-            count += 1
-        if count == 0:
-            raise ValueError(f"{path.name}: a video needs at least one frame")
-        container.mux(stream.encode())
-    return count
+            video.add(frame)
+    return video.count
 
 
 def _to_bytes(frame: Tensor, index: int) -> UInt8[Tensor, "height width 3"]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.similarity import Similarity, align_poses
+from sceneexpander.geometry.trajectory import focus_depth, mean_up
 
 _FRUSTUM_SHARE = 0.35  # length of a drawn frustum, share of the distance between neighbouring cameras
 _FRUSTUM_LIMITS = (0.02, 0.12)  # of the distance to what is seen, so that it neither vanishes nor fills the picture
@@ -32,14 +33,13 @@ class Cameras:
     def of(cls, reconstruction: Reconstruction) -> Cameras:
         """The cameras of a reconstruction."""
         height, width = reconstruction.depth.shape[1:]
-        middle = reconstruction.depth[:, height // 4 : height - height // 4, width // 4 : width - width // 4]
         return cls(
             view_ids=reconstruction.view_ids,
             generated=reconstruction.generated,
             posed=reconstruction.posed,
             world_from_cam=reconstruction.world_from_cam,
             intrinsics_px=reconstruction.intrinsics_px,
-            focus=middle.flatten(1).median(1).values,
+            focus=focus_depth(reconstruction.depth),
             height=height,
             width=width,
         )
@@ -64,10 +64,8 @@ class Cameras:
 
 
 def up_direction(cameras: Cameras) -> Float[Tensor, 3]:
-    """Where up is, as a unit vector of the world frame: people hold cameras upright, so the mean of what is up in the captured ones."""
-    mean = -cameras.world_from_cam[cameras.captured(), :3, 1].mean(0)
-    # Cameras that look up and down on opposite sides may cancel: then the first one decides.
-    return torch.nn.functional.normalize(mean if float(mean.norm()) > 0.2 else -cameras.world_from_cam[0, :3, 1], dim=0)
+    """Where up is, as a unit vector of the world frame, by the captured cameras."""
+    return mean_up(cameras.world_from_cam[cameras.captured()])
 
 
 def frustum_length(cameras: Cameras) -> float:

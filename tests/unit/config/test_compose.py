@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import fields
 from functools import cache
@@ -118,6 +119,13 @@ def test_the_gpu_profile_with_worldmirror_has_the_papers_values() -> None:
         ("adapt.steps=-1", "adapt: adapt.steps must be >= 0, is -1"),
         ("+adapt.extra=1", "adapt.extra: unknown key"),
         ("scene.fit=stretch", "scene.fit: is 'stretch'; known: crop, pad"),
+        ("render.path=obrit", "render.path: is 'obrit'; did you mean 'orbit'?"),
+        ("render.path=keyframes", "render.keyframes: path keyframes needs at least two, has 0"),
+        (
+            "render.keyframes=[{eye: [0, 0, 0], targt: [0, 0, 1]}]",
+            "render.keyframes[0].targt: unknown key; did you mean",
+        ),
+        ("render.keyframes=[{view: 3}]", "render.keyframes[0].view: is 3 (int), expected text"),
         ("device=tpu", "device: is 'tpu'; use cpu, cuda or cuda:N"),
         ("model=worldmirror", "model.weights: has no value; set it in conf/ or as an override"),
     ],
@@ -126,6 +134,17 @@ def test_a_typo_is_one_line_with_a_suggestion(override: str, message: str) -> No
     with pytest.raises(ConfigError) as caught:
         compose(CONF, [override])
     assert caught.value.line().startswith(message)
+
+
+def test_key_frames_come_from_an_override_or_from_a_file_of_ones_own(tmp_path: Path) -> None:
+    keys = "[{view: photo_1}, {eye: [0.5, 0, -1], target: [0, 0, 4]}]"
+    given = typed(composed("render.path=keyframes", f"render.keyframes={keys}")).render
+    conf = tmp_path / "conf"
+    shutil.copytree(CONF, conf)
+    text = f"defaults: [default, _self_]\npath: keyframes\nkeyframes: {keys}\n"
+    (conf / "render" / "flight.yaml").write_text(text)
+    assert typed(compose(conf, ["render=flight"])).render == given
+    assert [type(key).__name__ for key in given.keyframes] == ["ViewKey", "EyeKey"]
 
 
 def test_a_scene_without_a_file_of_its_own_takes_the_default() -> None:

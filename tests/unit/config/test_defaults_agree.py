@@ -10,6 +10,7 @@ from sceneexpander.artifacts.store import to_plain
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.ingest import IngestConfig
+from sceneexpander.rendering import RenderConfig
 
 CONF = Path(__file__).parents[3] / "conf"
 
@@ -21,6 +22,7 @@ CONF = Path(__file__).parents[3] / "conf"
         ("adapt", AdaptConfig()),
         ("evaluate", EvaluateConfig()),
         ("scene", IngestConfig()),
+        ("render", RenderConfig()),
     ],
 )
 def test_the_default_group_equals_the_default_of_the_code(group: str, default: object) -> None:

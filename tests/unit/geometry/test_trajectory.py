@@ -154,14 +154,38 @@ def test_shortest_path_of_a_row_of_cameras_walks_along_it() -> None:
     assert sorted(shortest_path_order(torch.eye(4).repeat(4, 1, 1))) == [0, 1, 2, 3]
 
 
-def test_orbit_looks_at_its_target_from_its_radius_and_side() -> None:
-    target = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    path = orbit(target, 2.0, 12, up=UP, elevation_rad=0.4)
-    eye = path[:, :3, 3]
-    torch.testing.assert_close((eye - target).norm(dim=-1), torch.full((12,), 2.0, dtype=torch.float64))
-    torch.testing.assert_close(path[:, :3, 2], (target - eye) / 2)
-    torch.testing.assert_close((eye - target) @ UP, torch.full((12,), 2 * math.sin(0.4), dtype=torch.float64))
-    assert (path[:, :3, 1] @ UP < 0).all()  # y points down in the image
+def test_orbit_carries_its_camera_around_the_target() -> None:
+    pose, target = random_cameras(1)[0][0], torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    path = orbit(pose, target, 12, up=3 * UP)
+    torch.testing.assert_close(path[0], pose)
+    away = pose[:3, 3] - target
+    eye = path[:, :3, 3] - target
+    torch.testing.assert_close(eye.norm(dim=-1), away.norm().expand(12))
+    torch.testing.assert_close(eye @ UP, (away @ UP).expand(12))  # as high as the camera
+    # The target stays where it is in the picture, and equal steps bring the camera back where it began.
+    seen = torch.einsum("fji,fj->fi", path[:, :3, :3], -eye)
+    torch.testing.assert_close(seen, (pose[:3, :3].T @ -away).expand(12, 3))
+    step = rotation_angle_deg(path[:, :3, :3], path.roll(-1, 0)[:, :3, :3])
+    torch.testing.assert_close(step, torch.full((12,), 30.0, dtype=torch.float64))
+
+
+def test_part_of_an_orbit_swings_to_both_sides() -> None:
+    pose, target = random_cameras(1)[0][0], torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
+    path = orbit(pose, target, 40, up=UP, turn_rad=math.radians(50))
+    turned = rotation_angle_deg(pose[:3, :3].expand(40, 3, 3), path[:, :3, :3])
+    assert float(turned.max()) == pytest.approx(25)
+    assert int(turned.argmax()) == 10
+    torch.testing.assert_close(path[20], pose)
+    apart = rotation_angle_deg(path[10, :3, :3], path[30, :3, :3])
+    assert float(apart) == pytest.approx(50)
+
+
+def test_orbit_refuses_nonsense() -> None:
+    pose = random_cameras(1)[0][0]
+    for changes in ({"frames": 0}, {"turn_rad": 0.0}, {"turn_rad": 7.0}, {"up": 0 * UP}):
+        values = {"frames": 5, "up": UP, "turn_rad": 1.0} | changes
+        with pytest.raises(ValueError, match="orbit with"):
+            orbit(pose, UP, values.pop("frames"), **values)  # type: ignore[arg-type]
 
 
 def test_spiral_starts_and_ends_at_its_camera_and_keeps_the_focus() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +15,9 @@ from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import camera_vector_from_pose
 from sceneexpander.geometry.gaussians import Gaussians
-from sceneexpander.rendering import RenderConfig, plan_tour, produce_renders
+from sceneexpander.geometry.rigid import rotation_angle_deg
+from sceneexpander.rendering import EyeKey, RenderConfig, ViewKey, plan_tour, produce_renders
+from sceneexpander.splatting.spz import read_spz
 
 HEIGHT, WIDTH = 21, 28
 CONFIG = RenderConfig(frames=9, fps=6, stills=3)
@@ -86,6 +89,72 @@ def test_views_without_a_camera_are_not_visited() -> None:
     torch.testing.assert_close(stops, torch.zeros(3), atol=1e-5, rtol=0)
 
 
+def test_the_orbit_starts_at_the_inserted_camera_and_keeps_what_it_looks_at() -> None:
+    tour = plan_tour(BACKBONE, BACKBONE, replace(CONFIG, path="orbit", orbit_deg=40.0))
+    torch.testing.assert_close(tour.world_from_cam[0], BACKBONE.world_from_cam[3])
+    assert tour.inserted_frame == 0
+    eye, ahead = tour.world_from_cam[:, :3, 3], tour.world_from_cam[:, :3, 2]
+    # It looks along +z from x = 1.5 at a wall 2 away.
+    torch.testing.assert_close(eye + 2 * ahead, torch.tensor([1.5, 0.0, 2.0]).expand(9, 3), atol=1e-5, rtol=0)
+    turned = rotation_angle_deg(torch.eye(3).expand(9, 3, 3), tour.world_from_cam[:, :3, :3])
+    assert 19 < float(turned.max()) <= 20.01
+    torch.testing.assert_close(eye[:, 1], torch.zeros(9), atol=1e-6, rtol=0)
+
+
+def test_the_spiral_stays_within_its_radius() -> None:
+    tour = plan_tour(BACKBONE, BACKBONE, replace(CONFIG, frames=60, path="spiral", spiral_radius=0.2))
+    away = (tour.world_from_cam[:, :3, 3] - BACKBONE.world_from_cam[3, :3, 3]).norm(dim=-1)
+    assert 0.3 < float(away.max()) < 1.2 * 0.2 * 2
+    torch.testing.assert_close(tour.world_from_cam[[0, -1]], BACKBONE.world_from_cam[[3, 3]], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral"])
+def test_other_paths_are_the_same_in_another_gauge(path: str) -> None:
+    captured = reconstruction("captured", [0.0, 0.4, 0.2], scale=3.0)
+    config = replace(CONFIG, path=path)  # type: ignore[arg-type]
+    ours, theirs = plan_tour(captured, BACKBONE, config), plan_tour(BACKBONE, BACKBONE, config)
+    moved = theirs.world_from_cam.clone()
+    moved[:, :3, 3] *= 3
+    torch.testing.assert_close(ours.world_from_cam, moved, atol=1e-3, rtol=0)
+    assert ours.inserted_camera == "backbone"
+
+
+def test_key_frames_are_passed_in_order_each_method_in_its_own_frame() -> None:
+    keys = (ViewKey(view="v1"), EyeKey(eye=(0.0, -1.0, 0.5), target=(0.3, 0.0, 2.0)), ViewKey(view="v3"))
+    config = replace(CONFIG, path="keyframes", keyframes=keys, frames=21)
+    tour = plan_tour(BACKBONE, BACKBONE, config)
+    torch.testing.assert_close(tour.world_from_cam[0], BACKBONE.world_from_cam[1])
+    torch.testing.assert_close(tour.world_from_cam[-1], BACKBONE.world_from_cam[3])
+    nearest = (tour.world_from_cam[:, :3, 3] - torch.tensor([0.0, -1.0, 0.5])).norm(dim=-1)
+    assert float(nearest.min()) < 1e-5
+    ahead = tour.world_from_cam[int(nearest.argmin()), :3, 2]
+    torch.testing.assert_close(ahead, torch.nn.functional.normalize(torch.tensor([0.3, 1.0, 1.5]), dim=0))
+    captured = plan_tour(reconstruction("captured", [0.0, 0.4, 0.2], scale=3.0), BACKBONE, config)
+    nearest = (captured.world_from_cam[:, :3, 3] - torch.tensor([0.0, -3.0, 1.5])).norm(dim=-1)
+    assert float(nearest.min()) < 1e-3
+
+
+def test_key_frames_that_cannot_be_are_refused() -> None:
+    for keys, message in (
+        ((ViewKey(view="v1"), ViewKey(view="v9")), "key frame 1 is at view 'v9'.*there are v0, v1, v2, v3"),
+        ((ViewKey(view="v1"), EyeKey(eye=(0.0, 0.0, 0.0), target=(0.0, 5.0, 0.0))), "key frame 1 looks straight up"),
+    ):
+        with pytest.raises(UserError, match=message):
+            plan_tour(BACKBONE, BACKBONE, replace(CONFIG, path="keyframes", keyframes=keys))
+    with pytest.raises(UserError, match="two finite places"):
+        EyeKey(eye=(0.0, 0.0, 0.0), target=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral"])
+def test_every_path_gives_three_videos(tmp_path: Path, path: str) -> None:
+    config = replace(CONFIG, path=path, spz=True)  # type: ignore[arg-type]
+    heard: list[int] = []
+    done = produce_renders(BACKBONE, BACKBONE, config, tmp_path, on_frame=heard.append)
+    assert heard == list(range(1, 10))
+    assert sorted(done.videos) == ["depth", "provenance", "rgb"]
+    assert len(read_spz(tmp_path / "gaussians.spz")) == len(BACKBONE.gaussians)
+
+
 def test_what_is_written_is_complete_and_reads_back(tmp_path: Path) -> None:
     done = produce_renders(BACKBONE, BACKBONE, CONFIG, tmp_path)
     read = Renders.load(tmp_path)
@@ -109,6 +178,16 @@ def test_renders_repeat_bit_for_bit(tmp_path: Path) -> None:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
-def test_settings_out_of_range_are_refused() -> None:
-    with pytest.raises(UserError, match=r"render\.frames: must be >= 2, is 1"):
-        RenderConfig(frames=1)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": 1}, r"render\.frames: must be >= 2, is 1"),
+        ({"crf": 52}, r"render\.crf: must be within \[0, 51\], is 52"),
+        ({"orbit_deg": 0.0}, r"render\.orbit_deg: must be within \(0, 360\]"),
+        ({"spiral_radius": 1.5}, r"render\.spiral_radius: must be within \(0, 1\]"),
+        ({"path": "keyframes"}, r"render\.keyframes: path keyframes needs at least two, has 0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        RenderConfig(**changes)
