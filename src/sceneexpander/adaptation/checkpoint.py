@@ -11,39 +11,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from sceneexpander.artifacts.store import ArtifactError, directory_being_written, load_artifact, save_artifact
 
-SCHEMA = "adaptation-checkpoint/1"
+SCHEMA = "adaptation-checkpoint/2"
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Checkpoint:
-    """State after ``step`` finished steps."""
+    """State after ``step`` finished steps. ``buckets`` is that of `WeightLedger.state`."""
 
     run_key: str  # hash of everything that determines the run
     step: int
-    student: dict[str, Tensor]
-    teacher: dict[str, Tensor]
-    first_moment: dict[str, Tensor]
-    second_moment: dict[str, Tensor]
-    optimiser_steps: dict[str, int]
+    buckets: list[tuple[tuple[str, ...], dict[str, Tensor]]]
     records: list[dict[str, Any]]
 
     def save(self, folder: Path) -> None:
         """Replace the checkpoint in ``folder`` atomically."""
-        tensors: dict[str, Tensor] = {}
-        for part in ("student", "teacher", "first_moment", "second_moment"):
-            tensors |= {f"{part}/{name}": value for name, value in getattr(self, part).items()}
         facts = {
             "run_key": self.run_key,
             "step": self.step,
-            "optimiser_steps": self.optimiser_steps,
+            "names": [names for names, _ in self.buckets],
             "records": self.records,
         }
+        tensors = {f"{i}/{key}": value for i, (_, parts) in enumerate(self.buckets) for key, value in parts.items()}
         with directory_being_written(folder) as scratch:
             save_artifact(scratch, SCHEMA, facts, tensors)
 
@@ -60,38 +53,9 @@ class Checkpoint:
         if facts["run_key"] != run_key:
             _log.warning("ignoring a checkpoint of another run in %s", folder)
             return None
-        parts: dict[str, dict[str, Tensor]] = {p: {} for p in ("student", "teacher", "first_moment", "second_moment")}
+        parts: list[dict[str, Tensor]] = [{} for _ in facts["names"]]
         for key, value in tensors.items():
-            part, _, name = key.partition("/")
-            parts[part][name] = value
-        return cls(
-            run_key=run_key,
-            step=facts["step"],
-            optimiser_steps=facts["optimiser_steps"],
-            records=facts["records"],
-            **parts,
-        )
-
-
-def optimiser_state(
-    optimiser: torch.optim.Optimizer, names: dict[Tensor, str]
-) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, int]]:
-    """(first moments, second moments, step counts) by parameter name; parameters never stepped are absent."""
-    first: dict[str, Tensor] = {}
-    second: dict[str, Tensor] = {}
-    steps: dict[str, int] = {}
-    for parameter, state in optimiser.state.items():
-        name = names[parameter]
-        first[name], second[name], steps[name] = state["exp_avg"], state["exp_avg_sq"], int(state["step"])
-    return first, second, steps
-
-
-def restore_optimiser(optimiser: torch.optim.Optimizer, parameters: dict[str, Tensor], saved: Checkpoint) -> None:
-    """Put a checkpoint's AdamW state back."""
-    for name, steps in saved.optimiser_steps.items():
-        parameter = parameters[name]
-        optimiser.state[parameter] = {
-            "step": torch.tensor(float(steps)),
-            "exp_avg": saved.first_moment[name].to(parameter.device).clone(),
-            "exp_avg_sq": saved.second_moment[name].to(parameter.device).clone(),
-        }
+            index, _, name = key.partition("/")
+            parts[int(index)][name] = value
+        buckets = [(tuple(names), part) for names, part in zip(facts["names"], parts, strict=True)]
+        return cls(run_key=run_key, step=facts["step"], buckets=buckets, records=facts["records"])

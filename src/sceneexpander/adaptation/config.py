@@ -45,6 +45,21 @@ class Precision(StrEnum):
     BF16 = "bf16"
 
 
+class MomentsForm(StrEnum):
+    """How AdamW's moments are kept: 8 bytes per weight, or 2 (see `sceneexpander.adaptation.moments`)."""
+
+    FP32 = "fp32"
+    INT8 = "int8"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngineConfig:
+    """How the steps are computed, not what: memory against time. Only ``moments: int8`` changes results beyond rounding."""
+
+    start_on_host: bool = False  # keep theta_0 in host memory; of use on a GPU
+    moments: MomentsForm = MomentsForm.FP32
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AugmentConfig:
     """Geometry-perturbation augmentation of captured views. Magnitudes are ours: the paper only says "weak"."""
@@ -102,6 +117,7 @@ class AdaptConfig:
     warp_targets: bool = False  # move the anchors of a warped view with its pixels
     precision: Precision = Precision.FP32
     checkpoint_every: int = 25  # steps between resume points; 0: none
+    engine: EngineConfig = field(default_factory=EngineConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
 
     def __post_init__(self) -> None:

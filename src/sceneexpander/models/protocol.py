@@ -74,7 +74,7 @@ class Reconstructor(Protocol):
         ...
 
 
-def as_module(model: Reconstructor) -> nn.Module:
+def as_module(model: object) -> nn.Module:
     """The same object, seen as the module it is."""
     if not isinstance(model, nn.Module):
         raise TypeError(f"{type(model).__name__} is not an nn.Module")
