@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sceneexpander.errors import UserError, entry_point
+from sceneexpander.errors import entry_point
 from sceneexpander.preflight import check_scene
 from sceneexpander.workspace import read_selection
 from stages import layout
-from stages.resolve import CONF
+from stages.resolve import CONF, read_methods
 
 
 @entry_point
 def main() -> None:
     """Raise the first problem as one line."""
     selection = read_selection(Path())
-    unknown = sorted(set(selection.methods) - set(layout.METHODS))
-    if unknown:
-        raise UserError(f"unknown {unknown[0]!r}", where="params.yaml: methods", fix=f"use {', '.join(layout.METHODS)}")
+    methods = read_methods(Path("params.yaml"))
     for scene in selection.scenes:
-        check_scene(scene, layout.source(scene), conf=CONF, overrides=selection.overrides, rounds=selection.rounds)
+        check_scene(
+            scene,
+            layout.source(scene),
+            conf=CONF,
+            overrides=selection.overrides,
+            rounds=selection.rounds,
+            rivals=[name for name in layout.RIVALS if name in methods],
+        )
 
 
 if __name__ == "__main__":

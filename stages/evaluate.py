@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.metrics import UnavailableRow
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
+from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.files import read_sections
 from sceneexpander.evaluation.config import EvaluateConfig
@@ -30,11 +32,23 @@ def main(cell: Cell) -> None:
     """Measure on the views of all rounds so far, on the tour, and against known truth where the scene has it."""
     sections = read_sections(layout.config(cell.scene), Sections)
     use_threads(sections.threads)
+    made = layout.reconstruction(cell.scene, cell.round, cell.method)
+    lacking = unavailable_in(made)
+    if lacking is not None:
+        UnavailableRow(
+            scene=cell.scene,
+            round=cell.round,
+            method=lacking.method,
+            model=lacking.model,
+            seed=sections.seed,
+            reason=lacking.reason,
+        ).save(layout.metrics(cell.scene, cell.round, cell.method))
+        return
     before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
     views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
     renders = Renders.load(layout.renders(cell.scene, cell.round, cell.method))
     row = evaluate(
-        Reconstruction.load(layout.reconstruction(cell.scene, cell.round, cell.method)),
+        Reconstruction.load(made),
         views,
         sections.evaluate,
         scene=cell.scene,

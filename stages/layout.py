@@ -9,7 +9,9 @@ OUTPUTS = Path("outputs")
 PAGES = OUTPUTS / "pages"  # what is shown of every scene, gathered from its artefacts
 REPORT = OUTPUTS / "report"
 CODE = OUTPUTS / "code.json"
-METHODS = ("captured", "backbone", "sceneexpander")
+OURS = ("captured", "backbone", "sceneexpander")  # always made: the pipeline itself needs them
+RIVALS = ("omnivggt", "ttt3r")  # networks of others
+METHODS = (*OURS, *RIVALS)
 
 
 def source(scene: str) -> Path:
@@ -20,6 +22,11 @@ def source(scene: str) -> Path:
 def config(scene: str) -> Path:
     """The composed configuration."""
     return OUTPUTS / scene / "config.yaml"
+
+
+def selection(scene: str) -> Path:
+    """Which methods params.yaml asks for: one key per method that is not always made."""
+    return OUTPUTS / scene / "methods.yaml"
 
 
 def prepared(scene: str) -> Path:
@@ -38,7 +45,7 @@ def state(scene: str, number: int) -> Path:
 
 
 def reconstruction(scene: str, number: int, method: str) -> Path:
-    """The `Reconstruction` that a method made in a round."""
+    """The `Reconstruction` that a method made in a round, or why there is none (`Unavailable`)."""
     return round_folder(scene, number) / method / "reconstruction"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.metrics import MetricsRow, Row, load_row
 from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
 from sceneexpander.config.files import read_yaml
 from sceneexpander.evaluation.table import comparison_table, scene_table
@@ -25,14 +25,18 @@ def _digits(value: float) -> float:
 def main(_: Cell) -> None:
     """Page, tables, numbers; scenes, rounds and methods as params.yaml lists them."""
     selected: dict[str, Any] = read_yaml(Path("params.yaml"))
-    rows: list[MetricsRow] = []
+    rows: list[Row] = []
     numbers: dict[str, Any] = {}
     for scene in selected["scenes"]:
         for item in selected["rounds"]:
             for method in selected["methods"]:
-                row = MetricsRow.load(layout.PAGES / scene / f"round_{item['k']}" / method / "metrics.json")
+                row = load_row(layout.PAGES / scene / f"round_{item['k']}" / method / "metrics.json")
                 rows.append(row)
-                known = {name: _digits(value) for name, value in row.numbers().items()}
+                known: dict[str, Any] = (
+                    {name: _digits(value) for name, value in row.numbers().items()}
+                    if isinstance(row, MetricsRow)
+                    else {"unavailable": row.reason}
+                )
                 numbers.setdefault(scene, {}).setdefault(f"round_{item['k']}", {})[method] = known
     with directory_being_written(layout.REPORT) as folder:
         write_page([layout.PAGES / scene for scene in selected["scenes"]], folder)

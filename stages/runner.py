@@ -17,7 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.unavailable import Unavailable
+from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import EXIT_BAD_INPUT, UserError
 from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV
 from stages import layout
@@ -107,6 +109,19 @@ def _measured(path: Path | None) -> Iterator[None]:
             record["host"]["gpu"] = torch.cuda.get_device_name()
             record["peak_gpu_mb"] = round(torch.cuda.max_memory_allocated() / 2**20, 1)
     write_json_atomic(path, record)
+
+
+def left_out(cell: Cell) -> bool:
+    """Whether params.yaml does not ask for the cell's method; then that is written down in place of its result.
+
+    The pipeline always has a stage for every method that can be asked for: its stages are fixed before params.yaml's list is read.
+    """
+    if read_yaml(layout.selection(cell.scene))[cell.method]:
+        return False
+    reason = Unavailable(method=cell.method, model="", reason="was not asked for")
+    with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
+        reason.save(folder / "reconstruction")
+    return True
 
 
 def use_threads(count: int) -> None:

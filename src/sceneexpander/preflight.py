@@ -15,7 +15,15 @@ from sceneexpander.generation import generate_inserted_view
 from sceneexpander.ingest import load_scene
 
 
-def check_scene(name: str, folder: Path, *, conf: Path, overrides: Sequence[str], rounds: int | None = None) -> int:
+def check_scene(
+    name: str,
+    folder: Path,
+    *,
+    conf: Path,
+    overrides: Sequence[str],
+    rounds: int | None = None,
+    rivals: Sequence[str] = (),
+) -> int:
     """Compose the configuration for a scene and read all of its pictures; nothing is written.
 
     Args:
@@ -24,6 +32,7 @@ def check_scene(name: str, folder: Path, *, conf: Path, overrides: Sequence[str]
         conf: the configuration folder.
         overrides: Hydra overrides.
         rounds: how many rounds are to run; None: all that the scene defines.
+        rivals: reconstructors of others that are to run; those without weights will say so in their rows.
 
     Returns:
         the number of rounds.
@@ -38,6 +47,17 @@ def check_scene(name: str, folder: Path, *, conf: Path, overrides: Sequence[str]
     for number in range(1, count + 1):
         generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
     check_weights(config.model)
+    for rival in rivals:
+        section = config.rivals.of(rival)
+        if section.weights is not None:
+            check_weights(
+                ModelConfig(
+                    name=rival,
+                    variant=section.variant,
+                    weights=section.weights,
+                    allow_download=section.allow_download,
+                )
+            )
     return count
 
 

@@ -29,7 +29,7 @@ from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV, SWEEP_ENV, find_proj
 COPIED_FOLDERS = ("conf", "src", "stages")
 COPIED_FILES = ("dvc.yaml", ".dvcignore", "pyproject.toml", ".dvc/config")
 ERROR_FILE = "error.txt"
-PATH_KEYS = frozenset({"model.weights", "generator.file"})
+PATH_KEYS = frozenset({"model.weights", "generator.file", "rivals.omnivggt.weights", "rivals.ttt3r.weights"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ from typing import Any
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
 
 SCHEMA = "metrics/1"
+UNAVAILABLE_SCHEMA = "metrics-unavailable/1"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,3 +133,33 @@ class MetricsRow:
             return cls(**content, views=views, truth=None if truth is None else TruthMetrics(**truth))
         except (KeyError, TypeError, ValueError) as error:
             raise ArtifactError(f"is invalid ({error})", where=path, fix="rerun the evaluation") from None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnavailableRow:
+    """The row of a method that could not be run: tables show ``reason`` where the numbers would be."""
+
+    scene: str
+    round: int
+    method: str
+    model: str
+    seed: int
+    reason: str
+
+    def save(self, path: Path) -> None:
+        """Write as a JSON file, atomically."""
+        write_json_atomic(path, {**{f.name: getattr(self, f.name) for f in fields(self)}, "schema": UNAVAILABLE_SCHEMA})
+
+
+Row = MetricsRow | UnavailableRow
+
+
+def load_row(path: Path) -> Row:
+    """Either kind of row. Raises `ArtifactError` for another schema or a damaged file."""
+    content = read_json(path)
+    if not isinstance(content, dict) or content.pop("schema", None) != UNAVAILABLE_SCHEMA:
+        return MetricsRow.load(path)
+    try:
+        return UnavailableRow(**content)
+    except TypeError as error:
+        raise ArtifactError(f"is invalid ({error})", where=path, fix="rerun the evaluation") from None

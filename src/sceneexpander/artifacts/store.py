@@ -114,7 +114,11 @@ def save_artifact(folder: Path, schema: str, facts: Mapping[str, object], tensor
     folder.mkdir(parents=True, exist_ok=True)
     if tensors:
         # A view into a larger storage would be written whole: contiguous copies only.
-        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(folder / TENSORS_NAME))
+        whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+        # The format holds each storage once: a tensor under two names is written twice.
+        first_name = {t.data_ptr(): name for name, t in reversed(whole.items())}
+        whole = {name: t if first_name[t.data_ptr()] == name else t.clone() for name, t in whole.items()}
+        save_file(whole, str(folder / TENSORS_NAME))
     write_json_atomic(folder / FACTS_NAME, {**to_plain(facts), "schema": schema})
 
 

@@ -11,6 +11,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.expansion import ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import GeneratorConfig
+from sceneexpander.inference.rivals import RivalsConfig
 from sceneexpander.ingest import IngestConfig
 from sceneexpander.rendering import RenderConfig
 from sceneexpander.tracking import TrackingConfig
@@ -29,6 +30,7 @@ class ProjectConfig:
     frontend: FrontendConfig
     warmup: WarmupConfig
     adapt: AdaptConfig
+    rivals: RivalsConfig
     render: RenderConfig
     evaluate: EvaluateConfig
     tracking: TrackingConfig

@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.metrics import MetricsRow, Row, UnavailableRow
 
 MISSING = "missing"
 NOT_APPLICABLE = "–"
@@ -15,8 +15,14 @@ CEILING = "captured"
 
 METHOD_TITLES = {
     "captured": "captured only (ceiling of preservation)",
+    "gaussian_splatting": "3DGS per scene, from the backbone's cameras and Gaussians",
+    "omnivggt": "OmniVGGT (pixel-aligned Gaussians)",
+    "omnivggt_optimised": "OmniVGGT (3DGS from its points and cameras)",
+    "ttt3r": "TTT3R (pixel-aligned Gaussians)",
+    "ttt3r_optimised": "TTT3R (3DGS from its points and cameras)",
     "backbone": "backbone with the inserted view, unadapted",
     "sceneexpander": "SceneExpander",
+    "sceneexpander_optimised": "SceneExpander + post-optimisation (3DGS)",
 }
 
 
@@ -69,8 +75,10 @@ class Table:
 Cell = tuple[str, int, int]  # scene, round, seed
 
 
-def comparison_table(rows: Sequence[MetricsRow], columns: Sequence[Column] = COLUMNS) -> Table:
+def comparison_table(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -> Table:
     """One line per method: the mean over all scene, round and seed cells that occur in ``rows`` for any method.
+
+    A method that could be run in no cell has its reason in the first number's place.
 
     A mean over fewer cells than there are is followed by its count, e.g. ``21.40 (3/4)``; without any value the cell says ``missing``.
     Columns that no row has a value for are left out. Means of lines with different counts cannot be compared.
@@ -79,40 +87,69 @@ def comparison_table(rows: Sequence[MetricsRow], columns: Sequence[Column] = COL
         ValueError: two rows have the same scene, round, seed and method.
     """
     by_key = _indexed(rows)
-    cells = sorted({key[0] for key in by_key})
+    cells = _cells(rows)
     shown = [column for column in columns if any(_value(by_key, *key, column) is not None for key in by_key)]
     lines = []
     for method in _methods(rows):
-        values = [_cell_text(by_key, cells, method, column) for column in shown]
-        lines.append((METHOD_TITLES.get(method, method), str(sum((cell, method) in by_key for cell in cells)), *values))
+        done = str(sum((cell, method) in by_key for cell in cells))
+        lines.append((METHOD_TITLES.get(method, method), done, *_cell_texts(rows, by_key, cells, method, shown)))
     header = ("method", f"cells of {len(cells)}", *(f"{column.title} {column.better}" for column in shown))
     return Table(header=header, lines=tuple(lines))
 
 
-def scene_table(rows: Sequence[MetricsRow], columns: Sequence[Column] = COLUMNS) -> Table:
+def scene_table(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -> Table:
     """One line per scene, round, seed and method, absent ones included as missing. Raises as `comparison_table`."""
     by_key = _indexed(rows)
     shown = [column for column in columns if any(_value(by_key, *key, column) is not None for key in by_key)]
     lines = []
-    for cell in sorted({key[0] for key in by_key}):
+    for cell in _cells(rows):
         for method in _methods(rows):
-            values = [_cell_text(by_key, [cell], method, column) for column in shown]
+            values = _cell_texts(rows, by_key, [cell], method, shown)
             lines.append((cell[0], str(cell[1]), str(cell[2]), METHOD_TITLES.get(method, method), *values))
     header = ("scene", "round", "seed", "method", *(f"{column.title} {column.better}" for column in shown))
     return Table(header=header, lines=tuple(lines))
 
 
-def _indexed(rows: Sequence[MetricsRow]) -> dict[tuple[Cell, str], MetricsRow]:
+def _cells(rows: Sequence[Row]) -> list[Cell]:
+    return sorted({(row.scene, row.round, row.seed) for row in rows})
+
+
+def _indexed(rows: Sequence[Row]) -> dict[tuple[Cell, str], MetricsRow]:
+    """Rows with numbers by cell and method."""
+    seen: set[tuple[Cell, str]] = set()
     found: dict[tuple[Cell, str], MetricsRow] = {}
     for row in rows:
         key = ((row.scene, row.round, row.seed), row.method)
-        if key in found:
+        if key in seen:
             raise ValueError(f"two rows for scene {row.scene!r}, round {row.round}, seed {row.seed}, {row.method!r}")
-        found[key] = row
+        seen.add(key)
+        if isinstance(row, MetricsRow):
+            found[key] = row
     return found
 
 
-def _methods(rows: Sequence[MetricsRow]) -> list[str]:
+def _cell_texts(
+    rows: Sequence[Row],
+    by_key: dict[tuple[Cell, str], MetricsRow],
+    cells: Sequence[Cell],
+    method: str,
+    columns: Sequence[Column],
+) -> list[str]:
+    """The line's numbers; where the method could be run in none of the cells: why, then gaps."""
+    if not any((cell, method) in by_key for cell in cells):
+        reasons = [
+            row.reason
+            for row in rows
+            if isinstance(row, UnavailableRow)
+            and row.method == method
+            and (row.scene, row.round, row.seed) in set(cells)
+        ]
+        if reasons:
+            return [*dict.fromkeys(reasons), *[NOT_APPLICABLE] * len(columns)][: len(columns)]
+    return [_cell_text(by_key, cells, method, column) for column in columns]
+
+
+def _methods(rows: Sequence[Row]) -> list[str]:
     known = list(METHOD_TITLES)
     return sorted({row.method for row in rows}, key=lambda m: (known.index(m) if m in known else len(known), m))
 

@@ -23,6 +23,7 @@ from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
+from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.protocol import Prediction
 
 
@@ -97,7 +98,14 @@ def reconstruct(
     views: ViewSet, priors: Priors, loaded: LoadedModel, weights: WeightsChange, *, method: str
 ) -> Reconstruction:
     """A reconstruction artefact of the views."""
-    return _as_reconstruction(predict(views, priors, loaded, weights), views, priors, loaded, weights, method)
+    return as_reconstruction(
+        predict(views, priors, loaded, weights),
+        views,
+        priors,
+        method=method,
+        model=loaded.model.name,
+        weights_sha256=loaded.fingerprint(weights),
+    )
 
 
 def captured_prediction(state: ExpansionState, loaded: LoadedModel) -> tuple[Anchors, Reconstruction]:
@@ -182,28 +190,4 @@ def _device_anchors(anchors: Anchors, loaded: LoadedModel) -> Anchors:
         normals=moved(anchors.normals),
         normals_conf=moved(anchors.normals_conf),
         gauge_view=anchors.gauge_view,
-    )
-
-
-def _as_reconstruction(
-    prediction: Prediction, views: ViewSet, priors: Priors, loaded: LoadedModel, weights: WeightsChange, method: str
-) -> Reconstruction:
-    parts = {
-        name: getattr(prediction, name) for name in ("depth", "depth_conf", "normals", "normals_conf", "gaussians")
-    }
-    missing = [name for name, value in parts.items() if value is None]
-    if missing:
-        raise ValueError(f"{loaded.model.name} gave no {', '.join(missing)}")
-    posed = torch.ones(len(views), dtype=torch.bool) if priors.posed is None else priors.posed
-    return Reconstruction(
-        method=method,
-        model=loaded.model.name,
-        weights_sha256=loaded.fingerprint(weights),
-        view_ids=views.view_ids,
-        generated=views.generated,
-        posed=posed.cpu(),
-        camera_vector=prediction.camera_vector.cpu(),
-        world_from_cam=prediction.world_from_cam.cpu(),
-        intrinsics_px=prediction.intrinsics_px.cpu(),
-        **{name: value.to("cpu") for name, value in parts.items() if value is not None},
     )

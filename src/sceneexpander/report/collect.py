@@ -16,6 +16,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.report.camera_map import camera_map
 from sceneexpander.report.words import method_words
@@ -23,6 +24,7 @@ from sceneexpander.viewer.packed import PackedSplats
 from sceneexpander.viewer.page import ShownMethod, viewer_page
 
 FACTS = "page.json"
+MAIN_METHOD = "sceneexpander"
 _PICTURE_SIDE_PX = 720
 _LOSSES = ("loss", "anchor_camera", "anchor_depth", "anchor_normal", "gen_camera", "gen_depth", "gen_normal", "drift")
 
@@ -89,7 +91,10 @@ def _write_viewers(source: SceneSource, scene: Scene, folder: Path) -> None:
         inserted = InsertedView.load(item.inserted).view
         pictures[inserted.view_ids[0]] = inserted.images[0]
         shown = []
-        for method in item.methods:
+        # The page opens with its last method.
+        for method in sorted(item.methods, key=lambda method: method.name == MAIN_METHOD):
+            if unavailable_in(method.splats) is not None:
+                continue
             splats = PackedSplats.load(method.splats)
             shown.append(ShownMethod(splats=splats, label=method_words(method.name, splats.model).label))
         known = {view for method in shown for view in method.splats.cameras.view_ids}
@@ -133,7 +138,8 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
         shutil.copyfile(sheet, folder / base / "sheet.png")
     spec = scene.round_spec(source.number)
     log = read_json(source.log)
-    methods = [_method(item, folder, f"{base}/{item.name}") for item in source.methods]
+    missing = {item.name: lacking for item in source.methods if (lacking := unavailable_in(item.reconstruction))}
+    methods = [_method(item, folder, f"{base}/{item.name}") for item in source.methods if item.name not in missing]
     return {
         "number": source.number,
         "prompt": spec.prompt,
@@ -149,6 +155,16 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
         "viewer": _viewer_place(source.number),
         "sheet": f"{base}/sheet.png" if sheet.is_file() else None,
         "methods": methods,
+        "unavailable": [
+            {
+                "name": item.name,
+                "model": missing[item.name].model,
+                "reason": missing[item.name].reason,
+                "metrics": _copy(item.metrics, folder, f"{base}/{item.name}/metrics.json"),
+            }
+            for item in source.methods
+            if item.name in missing
+        ],
         "series": {name: [record[name] for record in log] for name in _LOSSES if log and name in log[0]},
         "statistics": _statistics(source.statistics),
         "warnings": _warnings(methods, chosen.parameters),

@@ -10,11 +10,10 @@ from typing import Any
 
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.store import read_json, write_bytes_atomic
-from sceneexpander.report.collect import FACTS
+from sceneexpander.report.collect import FACTS, MAIN_METHOD
 from sceneexpander.report.curve import loss_curve
 from sceneexpander.report.words import COLUMNS, LAYERS, Column, method_words
 
-MAIN_METHOD = "sceneexpander"
 _ARROWS = {"higher": "\u2191", "lower": "\u2193", "": ""}
 
 
@@ -78,6 +77,9 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
         "main": MAIN_METHOD,
         "columns": [{"label": c.label, "meaning": c.meaning, "better": _ARROWS[c.better]} for c in columns],
         "table": [_table_row(method, rows, columns) for method in methods],
+        "unavailable": [
+            {**item, "label": method_words(item["name"], item["model"]).label} for item in facts["unavailable"]
+        ],
         "curve": loss_curve(series["loss"]) if series.get("loss") else "",
         "steps": len(series.get("loss", ())),
         "view_rows": _view_rows(facts, scene, methods),

@@ -41,6 +41,37 @@ METHODS = {
         short="unadapted",
         meaning="{model} given the captured photos and the inserted picture, with its weights as they were before this round.",
     ),
+    "gaussian_splatting": MethodWords(
+        label="3DGS per scene, from {model}",
+        short="optimised on all views",
+        meaning="Gaussians optimised on the captured photos and the inserted picture, started from the cameras and Gaussians of {model} "
+        "with the inserted view.",
+    ),
+    "omnivggt": MethodWords(
+        label="OmniVGGT, pixel-aligned",
+        short="another reconstructor",
+        meaning="OmniVGGT given the same pictures; it has no Gaussians, so every pixel of its depth becomes one by the project's rule.",
+    ),
+    "ttt3r": MethodWords(
+        label="{model}, pixel-aligned",
+        short="another reconstructor",
+        meaning="{model} given the same pictures one after the other, the inserted one last; its points become Gaussians by the same rule.",
+    ),
+    "omnivggt_optimised": MethodWords(
+        label="OmniVGGT, optimised",
+        short="3DGS from its points",
+        meaning="3DGS optimised on the same pictures, started from OmniVGGT's own points and cameras.",
+    ),
+    "ttt3r_optimised": MethodWords(
+        label="{model}, optimised",
+        short="3DGS from its points",
+        meaning="3DGS optimised on the same pictures, started from {model}'s own points and cameras.",
+    ),
+    "sceneexpander_optimised": MethodWords(
+        label="SceneExpander on {model} + post-optimisation",
+        short="adapted, then optimised",
+        meaning="SceneExpander's Gaussians optimised further on the same pictures: an addition, not the method.",
+    ),
     "sceneexpander": MethodWords(
         label="SceneExpander on {model}",
         short="after the adaptation",

@@ -33,6 +33,8 @@ def scene_runs(
         _run(facts, item, method, folder, commit, extra(item["number"], method["name"]))
         for item in facts["rounds"]
         for method in item["methods"]
+    ] + [
+        _unavailable(facts, item, method, folder, commit) for item in facts["rounds"] for method in item["unavailable"]
     ]
 
 
@@ -83,10 +85,26 @@ def _run(
     )
 
 
+def _unavailable(
+    facts: Mapping[str, Any], item: Mapping[str, Any], method: Mapping[str, Any], folder: Path, commit: str
+) -> RunRecord:
+    """A run without a number: a comparison shows the gap and why it is there."""
+    scene, number, name = folder.name, item["number"], method["name"]
+    variant = variant_name(facts["overrides"])
+    identity = {"variant": variant, "round": str(number), "method": name, "reconstructor": method["model"]}
+    return RunRecord(
+        key=run_key(facts["config"], facts["overrides"], method["reason"], scene, number, name),
+        name=f"{scene} r{number} {name}: {method['reason']}" + ("" if variant == "default" else f" [{variant}]"),
+        params={**identity, "scene_name": scene, "prompt": item["prompt"], **flatten(facts["config"])},
+        metrics={},
+        tags={**identity, "scene": scene, "unavailable": method["reason"], "mlflow.source.git.commit": commit},
+    )
+
+
 def _belongs(stage: str, method: str) -> bool:
     """Whether a stage's time counts for a method: its own renders and evaluation, and what made it."""
     makers = {"captured": "precompute_anchors", "backbone": "reconstruct_inserted", "sceneexpander": "adapt"}
-    return stage.endswith(f"-{method}") or stage == makers.get(method)
+    return stage.endswith(f"-{method}") or stage == makers.get(method, method)
 
 
 def _artefacts(

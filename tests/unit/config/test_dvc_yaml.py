@@ -43,7 +43,8 @@ def test_a_stage_depends_on_its_own_code(stage: str) -> None:
 @pytest.mark.parametrize("stage", sorted(set(PIPELINE) - WITHOUT_SECTIONS))
 def test_parameters_are_the_sections_that_the_stage_reads(stage: str) -> None:
     sections = importlib.import_module(f"stages.{stage}").Sections
-    assert tracked(stage, CONFIG) == [f.name for f in fields(sections)]
+    # A key below a section: the part of it that belongs to the stage's method.
+    assert [key.partition(".")[0] for key in tracked(stage, CONFIG)] == [f.name for f in fields(sections)]
 
 
 def filled(path: str) -> str:
@@ -55,7 +56,7 @@ def filled(path: str) -> str:
 @pytest.mark.parametrize(
     ("stage", "written"),
     [
-        ("resolve", [layout.config("S")]),
+        ("resolve", [layout.config("S"), layout.selection("S")]),
         ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
         ("reconstruct", [layout.state("S", 0), layout.statistics("reconstruct", "S")]),
         ("generate_view", [layout.inserted("S", 2), layout.statistics("generate_view", "S", 2)]),
@@ -76,6 +77,10 @@ def filled(path: str) -> str:
             ],
         ),
         ("adapt", [layout.state("S", 2), layout.statistics("adapt", "S", 2)]),
+        (
+            "rival",
+            [layout.reconstruction("S", 2, "backbone").parent, layout.statistics("rival", "S", 2, "backbone")],
+        ),
         ("render", [layout.renders("S", 2, "backbone"), layout.statistics("render", "S", 2, "backbone")]),
         ("pack", [layout.packed("S", 2, "backbone"), layout.statistics("pack", "S", 2, "backbone")]),
         ("evaluate", [layout.metrics("S", 2, "backbone"), layout.statistics("evaluate", "S", 2, "backbone")]),
@@ -103,4 +108,5 @@ def test_resume_points_are_no_outputs_and_nothing_persists_but_the_marker() -> N
 def test_selected_methods_exist() -> None:
     params = yaml.safe_load((ROOT / "params.yaml").read_text())
     assert set(params["methods"]) <= set(layout.METHODS)
+    assert PIPELINE["rival"]["matrix"]["method"] == list(layout.RIVALS)
     assert [item["prev"] for item in params["rounds"]] == [item["k"] - 1 for item in params["rounds"]]

@@ -7,7 +7,7 @@ import io
 
 import pytest
 
-from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics
+from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics, UnavailableRow
 from sceneexpander.evaluation import comparison_table, scene_table
 
 
@@ -52,6 +52,23 @@ def test_shape_and_means() -> None:
         ["backbone with the inserted view, unadapted", "2", "18.50", "0.500", "19.00", "0.800", "0.200"],
         ["SceneExpander", "2", "21.00", "0.500", "17.50", "0.850", "0.250"],
     ]
+
+
+def test_a_method_that_could_not_be_run_has_its_reason_in_the_line() -> None:
+    reason = "needs the public checkpoint"
+    lost = UnavailableRow(scene="a", round=1, method="ttt3r", model="ttt3r", seed=0, reason=reason)
+    rows = [row("a", "captured", 25.0), row("b", "captured", 15.0), lost, row("b", "omnivggt", 12.0)]
+    header, *lines = cells(comparison_table(rows).csv())
+    assert header == ["method", "cells of 2", "PSNR ↑", "SSIM ↑"]
+    assert lines[1:] == [
+        ["OmniVGGT (pixel-aligned Gaussians)", "1", "12.00 (1/2)", "0.500 (1/2)"],
+        ["TTT3R (pixel-aligned Gaussians)", "0", reason, "–"],
+    ]
+    per_scene = cells(scene_table(rows).csv())
+    assert ["a", "1", "0", "TTT3R (pixel-aligned Gaussians)", reason, "–"] in per_scene
+    assert ["b", "1", "0", "TTT3R (pixel-aligned Gaussians)", "missing", "missing"] in per_scene
+    with pytest.raises(ValueError, match="two rows"):
+        comparison_table([lost, lost])
 
 
 def test_gaps_are_shown_not_averaged_over() -> None:

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
-from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.metrics import MetricsRow, UnavailableRow
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
+from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.rendering import RenderConfig, produce_renders
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene, write_page
@@ -26,6 +27,7 @@ from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
 NASTY = '<script>alert("1")</script> & "quotes"'
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 METHODS = ("captured", "backbone", "sceneexpander")
+LACKING = Unavailable(method="ttt3r", model="ttt3r", reason="needs the public checkpoint")
 
 
 def view(view_id: str, *, generated: bool = False) -> ViewSet:
@@ -87,6 +89,11 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
         produce_renders(item, backbone, RenderConfig(frames=5, stills=2), folder / "renders" / name)
         pack_splats(item).save(folder / "packed" / name)
         row(name, 20.0 + index).save(folder / "metrics" / f"{name}.json")
+    for place in (folder, folder / "renders", folder / "packed"):
+        LACKING.save(place / "ttt3r")
+    UnavailableRow(scene="room", round=1, method="ttt3r", model="ttt3r", seed=0, reason=LACKING.reason).save(
+        folder / "metrics" / "ttt3r.json"
+    )
     write_json_atomic(
         folder / "report.json",
         {"model": "mini", "weights_sha256": "4" * 64, "licence": "free", "warmup": None, "sparse_points": 7},
@@ -113,7 +120,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
                         splats=folder / "packed" / name,
                         metrics=folder / "metrics" / f"{name}.json",
                     )
-                    for name in METHODS
+                    for name in (*METHODS, "ttt3r")
                 ],
                 log=folder / "log.json",
                 statistics=folder / "stats",
@@ -189,6 +196,13 @@ def test_it_says_what_rows_and_columns_mean_and_what_went_wrong(page: Path) -> N
     assert "is blurred" in html
 
 
+def test_a_method_that_could_not_be_run_says_why_where_its_numbers_would_be(page: Path) -> None:
+    rows = page.read_text().split("<tbody>")[1].split("</tbody>")[0].split("<tr ")
+    (lacking,) = [row for row in rows if 'class="ttt3r"' in row]
+    assert "needs the public checkpoint" in lacking
+    assert not re.search(r">[\d.]+<", lacking), "no number"
+
+
 def test_bold_compares_methods_with_the_inserted_view(page: Path) -> None:
     table = page.read_text().split("<tbody>")[1].split("</tbody>")[0]
     bold = re.findall(r'<td class="best">([^<]+)</td>', table)
@@ -213,8 +227,11 @@ def test_runs_to_track_come_from_the_same_folder(gathered: Path, tmp_path: Path)
     ply = tmp_path / "gaussians.ply"
     ply.write_bytes(b"ply")
     runs = {run.tags["method"]: run for run in scene_runs(gathered, commit="abc", extra=lambda number, method: [ply])}
+    lacking = runs.pop("ttt3r")
+    assert not lacking.metrics
+    assert lacking.tags["unavailable"] == "needs the public checkpoint"
     assert set(runs) == set(METHODS)
-    assert len({run.key for run in runs.values()}) == 3
+    assert len({run.key for run in (*runs.values(), lacking)}) == 4
     adapted = runs["sceneexpander"]
     assert adapted.series["loss/loss"] == (2.0, 1.0, 2.0 / 3)
     assert not runs["backbone"].series

@@ -1,0 +1,1 @@
+"""A reconstructor run once on given views, and what it predicted as an artefact."""

@@ -1,0 +1,39 @@
+"""From a prediction in memory to the artefact on disk."""
+
+from __future__ import annotations
+
+import torch
+
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.geometry.priors import Priors
+from sceneexpander.models.protocol import Prediction
+
+
+def as_reconstruction(
+    prediction: Prediction, views: ViewSet, priors: Priors, *, method: str, model: str, weights_sha256: str
+) -> Reconstruction:
+    """A prediction with all heads, on the CPU. Cameras count as estimated unless ``priors`` say that a pose was a placeholder.
+
+    Raises:
+        ValueError: an output is missing.
+    """
+    parts = {
+        name: getattr(prediction, name) for name in ("depth", "depth_conf", "normals", "normals_conf", "gaussians")
+    }
+    missing = [name for name, value in parts.items() if value is None]
+    if missing:
+        raise ValueError(f"{model} gave no {', '.join(missing)}")
+    posed = torch.ones(len(views), dtype=torch.bool) if priors.posed is None else priors.posed
+    return Reconstruction(
+        method=method,
+        model=model,
+        weights_sha256=weights_sha256,
+        view_ids=views.view_ids,
+        generated=views.generated,
+        posed=posed.cpu(),
+        camera_vector=prediction.camera_vector.cpu(),
+        world_from_cam=prediction.world_from_cam.cpu(),
+        intrinsics_px=prediction.intrinsics_px.cpu(),
+        **{name: value.to("cpu") for name, value in parts.items() if value is not None},
+    )

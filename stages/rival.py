@@ -1,0 +1,42 @@
+"""rival: another reconstructor, given the captured views and the inserted one like any other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.state import load_priors
+from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.config.files import read_sections
+from sceneexpander.inference.rivals import RivalsConfig, reconstruct_rival
+from stages import layout
+from stages.runner import Cell, left_out, stage, use_threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sections:
+    """What this stage reads of the configuration."""
+
+    device: str
+    threads: int
+    rivals: RivalsConfig
+
+
+@stage("scene", "round", "previous", "method")
+def main(cell: Cell) -> None:
+    """Reconstruct all views with the rival's own weights, or write down why it cannot be."""
+    if left_out(cell):
+        return
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_threads(sections.threads)
+    before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
+    views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
+    priors = load_priors(layout.joint_priors(cell.scene, cell.round))
+    made = reconstruct_rival(cell.method, sections.rivals.of(cell.method), views, priors, device=sections.device)
+    with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
+        made.save(folder / "reconstruction")
+
+
+if __name__ == "__main__":
+    main()
