@@ -107,15 +107,21 @@ def _block_warp(
     count = config.grid
     aspect = width / height
     affines = random_affine(config, count * count, config.block_strength, aspect, generator)
+    steps = (2 * torch.arange(count) + 1) / count - 1
+    centres = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).flatten(0, 1)
+    # A block moves a point p to A (p - c) + t + c. That is affine in p, so the blend of all blocks' displacements is the blend of
+    # their matrices: six numbers per pixel instead of one grid per block. Units: `affines` are isotropic, the grid is not.
+    unit = torch.tensor([aspect, 1.0])
+    linear = affines[:, :, :2] * unit / unit[:, None] - torch.eye(2)
+    constant = affines[:, :, 2] / unit - (linear @ centres[..., None])[..., 0]
+    numbers = torch.cat([linear.flatten(1), constant], dim=1).view(count, count, 6)
     rows = _block_weights(height, count, config.feather)
     columns = _block_weights(width, count, config.feather)
-    offset = torch.zeros_like(grid)
-    for r in range(count):
-        for c in range(count):
-            centre = torch.tensor([(2 * c + 1) / count - 1, (2 * r + 1) / count - 1])
-            moved = _apply_affine(affines[r * count + c], grid, centre, aspect)
-            offset += (rows[r][:, None] * columns[c])[..., None] * (moved - grid)
-    return grid + offset
+    field = torch.einsum("rh,cw,rck->hwk", rows, columns, numbers)
+    x, y = grid.unbind(-1)
+    offset_x = field[..., 0] * x + field[..., 1] * y + field[..., 4]
+    offset_y = field[..., 2] * x + field[..., 3] * y + field[..., 5]
+    return grid + torch.stack([offset_x, offset_y], dim=-1)
 
 
 def sample(

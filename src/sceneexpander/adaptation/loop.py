@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import math
 import time
@@ -12,22 +10,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.adaptation.augmentation import augment_view
 from sceneexpander.adaptation.checkpoint import Checkpoint
 from sceneexpander.adaptation.config import AdaptConfig, DriftForm, Precision
+from sceneexpander.adaptation.inputs import AdaptationInputs, StepViews, ViewSource, geometry_of, run_key
 from sceneexpander.adaptation.ledger import WeightLedger, teacher_of
 from sceneexpander.adaptation.losses import ViewGeometry
-from sceneexpander.adaptation.objective import Grid, NonFiniteLoss, anchor_targets, step_losses
-from sceneexpander.adaptation.sampling import Batch, sample_batch
-from sceneexpander.artifacts.anchors import Anchors
-from sceneexpander.artifacts.store import sha256_of_tensors, to_plain
-from sceneexpander.geometry.gauge import priors_relative_to
-from sceneexpander.geometry.priors import Priors
-from sceneexpander.geometry.randomness import child_generator
-from sceneexpander.models.protocol import GEOMETRY_HEADS, Prediction, Reconstructor, as_module
+from sceneexpander.adaptation.objective import NonFiniteLoss, anchor_targets, step_losses
+from sceneexpander.adaptation.sampling import sample_batch
+from sceneexpander.models.protocol import Reconstructor, as_module
 
 _log = logging.getLogger(__name__)
 
@@ -54,22 +46,6 @@ class StepRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AdaptationInputs:
-    """What a round adapts to: n captured views, one inserted view, and the frozen model's anchors on the captured ones.
-
-    ``captured_priors`` describe the captured views alone, ``joint_priors`` the captured views followed by the inserted one; a
-    step that does not see the inserted view uses the former, so that with p = 0 nothing of the inserted view reaches the student.
-    Models without priors get None for both.
-    """
-
-    captured: Float[Tensor, "captured 3 height width"]
-    inserted: Float[Tensor, "3 height width"]
-    anchors: Anchors
-    captured_priors: Priors | None
-    joint_priors: Priors | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptationResult:
     """theta* and the log. ``seconds`` is the wall time of the steps run by this call."""
 
@@ -77,29 +53,6 @@ class AdaptationResult:
     teacher: dict[str, Tensor]
     records: tuple[StepRecord, ...]
     seconds: float
-
-
-def geometry_of(prediction: Prediction) -> ViewGeometry:
-    """The part of a prediction that the losses read."""
-    if prediction.depth is None or prediction.normals is None:
-        raise ValueError("the adaptation needs the depth and normal heads")
-    return ViewGeometry(camera_vector=prediction.camera_vector, depth=prediction.depth, normals=prediction.normals)
-
-
-def run_key(model: Reconstructor, inputs: AdaptationInputs, config: AdaptConfig, seed: int) -> str:
-    """Hash of everything that determines an adaptation: weights, views, anchors, priors, configuration, seed."""
-    tensors: dict[str, Tensor] = {f"weights/{k}": v for k, v in as_module(model).state_dict().items()}
-    tensors |= {"captured": inputs.captured, "inserted": inputs.inserted}
-    for label, value in (
-        ("anchors", inputs.anchors),
-        ("captured", inputs.captured_priors),
-        ("joint", inputs.joint_priors),
-    ):
-        if value is not None:
-            plain = {f.name: getattr(value, f.name) for f in value.__dataclass_fields__.values()}
-            tensors |= {f"{label}/{k}": v for k, v in plain.items() if isinstance(v, Tensor)}
-    settings = json.dumps({"config": to_plain(config), "seed": seed, "model": model.name}, sort_keys=True)
-    return hashlib.sha256(f"{sha256_of_tensors(tensors)}:{settings}".encode()).hexdigest()
 
 
 def adapt(
@@ -158,6 +111,7 @@ class Run:
             raise ValueError(f"{inputs.captured.shape[0]} captured views, {len(inputs.anchors.view_ids)} anchors")
         self.model, self.inputs, self.config, self.seed = model, inputs, config, seed
         self.teacher: Reconstructor = teacher_of(model)
+        self.source = ViewSource(model, inputs, config, seed=seed)
         self.ledger = WeightLedger(as_module(model), as_module(self.teacher), config, seed=seed)
         anchors = inputs.anchors
         self.anchors = ViewGeometry(camera_vector=anchors.camera_vector, depth=anchors.depth, normals=anchors.normals)
@@ -166,13 +120,12 @@ class Run:
         """One pass of the loop body of Algorithm 1."""
         config = self.config
         batch = sample_batch(self.inputs.captured.shape[0], config, seed=self.seed, step=step)
-        images, grids = self._images(batch, step)
-        priors = self._priors(batch)
+        views = self.source.views(batch, step)
         # First the teacher: its activations are gone when the student's, which are kept, are made.
-        teacher = self._teach(images, priors).view(len(batch.captured)) if batch.inserted else None
+        teacher = self._teach(views, len(batch.captured)) if batch.inserted else None
         with self._autocast():
-            student = geometry_of(self.model.predict(images, priors, heads=GEOMETRY_HEADS))
-        targets = anchor_targets(self.anchors, batch, grids, student, config)
+            student = geometry_of(views.predict(self.model))
+        targets = anchor_targets(self.anchors, batch, views.grids, student, config)
         losses = step_losses(student, targets, teacher, config)
         values = losses.values(step)
         losses.objective.backward()  # type: ignore[no-untyped-call]
@@ -191,34 +144,15 @@ class Run:
             **values,
         )
 
-    def _teach(self, images: Tensor, priors: Priors | None) -> ViewGeometry:
-        """The EMA teacher's prediction on the step's very views."""
-        with torch.no_grad(), self._autocast():
-            return geometry_of(self.teacher.predict(images, priors, heads=GEOMETRY_HEADS))
+    def _teach(self, views: StepViews, captured: int) -> ViewGeometry:
+        """The EMA teacher's prediction of the inserted view, from the step's very views."""
+        with torch.inference_mode(), self._autocast():
+            taught = geometry_of(views.predict(self.teacher)).view(captured)
+        return taught.clone()  # as ordinary tensors, which a loss may keep
 
     def _autocast(self) -> torch.autocast:
         device = self.inputs.captured.device.type
         return torch.autocast(device, dtype=torch.bfloat16, enabled=self.config.precision is Precision.BF16)
-
-    def _images(self, batch: Batch, step: int) -> tuple[Tensor, list[Grid | None]]:
-        """The step's views (captured ones augmented, the inserted one as it is) and the warps of the captured ones."""
-        images, grids = [], []
-        for index in batch.captured:
-            generator = child_generator(self.seed, f"adapt/augment/{step}/{index}")
-            image, grid = augment_view(self.inputs.captured[index], self.config.augment, generator)
-            images.append(image)
-            grids.append(grid)
-        if batch.inserted:
-            images.append(self.inputs.inserted)
-        return torch.stack(images), grids
-
-    def _priors(self, batch: Batch) -> Priors | None:
-        source = self.inputs.joint_priors if batch.inserted else self.inputs.captured_priors
-        if source is None:
-            return None
-        views = [*batch.captured, self.inputs.captured.shape[0]] if batch.inserted else list(batch.captured)
-        picked = source.select(views)
-        return picked if batch.captured[0] == 0 else priors_relative_to(picked, 0)
 
     def checkpoint(self, key: str, step: int, records: list[StepRecord]) -> Checkpoint:
         """Everything that step ``step + 1`` depends on."""

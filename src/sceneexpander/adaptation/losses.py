@@ -31,6 +31,12 @@ class ViewGeometry:
             normals=self.normals[start:stop],
         )
 
+    def clone(self) -> ViewGeometry:
+        """The same values in memory of their own."""
+        return ViewGeometry(
+            camera_vector=self.camera_vector.clone(), depth=self.depth.clone(), normals=self.normals.clone()
+        )
+
     def detach(self) -> ViewGeometry:
         """The same values as targets, outside the autograd graph."""
         return ViewGeometry(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -71,6 +72,37 @@ class Reconstructor(Protocol):
             heads: outputs to compute.
             generated: which views are generated, copied onto the Gaussians as provenance (default: none).
         """
+        ...
+
+
+class Measured(Protocol):
+    """What a reconstructor makes of the priors of some views alone."""
+
+    def select(self, views: Sequence[int]) -> Self:
+        """Some of the views, in the given order; the first of them becomes the world frame."""
+        ...
+
+
+@runtime_checkable
+class PreparesInputs(Protocol):
+    """A reconstructor that measures its inputs before its network runs.
+
+    What is measured does not depend on the weights: one preparation serves student and teacher, and one measurement of the
+    priors serves every step. ``predict(images, priors)`` is the three in a row.
+    """
+
+    def measure(self, priors: Priors | None, views: int, height: int, width: int) -> Any:
+        """A `Measured` of all views, once."""
+        ...
+
+    def prepare(self, images: Float[Tensor, "view 3 height width"], measured: Any) -> Any:
+        """The network's input for the views that ``measured`` holds."""
+        ...
+
+    def predict_prepared(
+        self, prepared: Any, *, heads: frozenset[Head] = ALL_HEADS, generated: Bool[Tensor, "view"] | None = None
+    ) -> Prediction:
+        """As `Reconstructor.predict`, from a prepared input."""
         ...
 
 

@@ -10,11 +10,13 @@ import torch
 
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.gauge import priors_relative_to
 from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.geometry.rigid import rigid_from_parts, rigid_inverse, rotation_from_quat_wxyz
 from sceneexpander.models.mini import Mini, MiniConfig
-from sceneexpander.models.mini.inputs import compare_views, splat_log_depth, working_size
+from sceneexpander.models.mini.inputs import working_size
+from sceneexpander.models.mini.pairs import PairGeometry, splat_log_depth
 from sceneexpander.models.mini.splats import covered_by_others
 from sceneexpander.models.mini.training.augment import mirrored
 from sceneexpander.models.mini.training.generate import Conditions, sample_of_scene
@@ -273,13 +275,29 @@ def test_cross_view_channels_tell_front_from_behind() -> None:
     posed = torch.ones(2, dtype=torch.bool)
     confident = torch.ones(2, 40, 40)
     log_depth = torch.log(torch.stack([torch.full((40, 40), 3.0), torch.full((40, 40), 2.0)]))
-    channels = compare_views(images, log_depth, confident, poses, intrinsics, posed, most_views=4)
+    geometry = PairGeometry(log_depth, confident, poses, intrinsics, posed)
+    channels = geometry.compare(images, (0, 1), most_views=4)
     behind, in_front = channels[:, 2, 20, 20], channels[:, 3, 20, 20]
     ratio = torch.log(torch.tensor(1.5))
     torch.testing.assert_close(behind, torch.stack([ratio, torch.zeros(())]), atol=1e-5, rtol=0)
     torch.testing.assert_close(in_front, torch.stack([torch.zeros(()), ratio]), atol=1e-5, rtol=0)
     posed[1] = False
-    assert compare_views(images, log_depth, confident, poses, intrinsics, posed, most_views=4).abs().max() == 0
+    unposed = PairGeometry(log_depth, confident, poses, intrinsics, posed)
+    assert unposed.compare(images, (0, 1), most_views=4).abs().max() == 0
+
+
+@pytest.mark.parametrize("views", [(0, 1, 3), (0, 2, 3, 4), (2, 1, 4)])
+def test_what_is_measured_once_serves_every_subset(views: tuple[int, ...]) -> None:
+    images, priors = scene(5, 56, 84)
+    model = make_model(perturbed=True)
+    measured = model.measure(priors, 5, 56, 84)
+    for _ in range(2):  # the second time from what is kept
+        shared = model.predict_prepared(
+            model.prepare(images[list(views)], measured.select(views)), heads=GEOMETRY_HEADS
+        )
+        direct = model.predict(images[list(views)], priors_relative_to(priors.select(views), 0), heads=GEOMETRY_HEADS)
+        for name in ("camera_vector", "depth", "depth_conf", "normals", "normals_conf"):
+            torch.testing.assert_close(getattr(shared, name), getattr(direct, name), rtol=1e-4, atol=1e-5)
 
 
 def test_splatted_depth_keeps_the_nearest_point() -> None:

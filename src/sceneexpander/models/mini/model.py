@@ -18,7 +18,7 @@ from sceneexpander.geometry.camera import camera_vector_from_pose, pose_from_cam
 from sceneexpander.geometry.normals import face_camera, viewing_rays
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.mini.config import MiniConfig
-from sceneexpander.models.mini.inputs import RequiredPriors, require_priors, working_views
+from sceneexpander.models.mini.inputs import MeasuredPriors, PreparedViews, measure, prepare
 from sceneexpander.models.mini.network import MiniNetwork
 from sceneexpander.models.mini.splats import covered_by_others, pixel_aligned_gaussians
 from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction
@@ -60,23 +60,44 @@ class Mini(nn.Module):
             ValueError: H or W is no multiple of ``size_multiple``, or priors are missing or do not fit.
         """
         views, _, height, width = images.shape
+        prepared = self.prepare(images, self.measure(priors, views, height, width))
+        return self.predict_prepared(prepared, heads=heads, generated=generated)
+
+    @torch.no_grad()
+    def measure(self, priors: Priors | None, views: int, height: int, width: int) -> MeasuredPriors:
+        """See `PreparesInputs.measure`. Raises `ValueError` as `predict` does."""
         if height % self.size_multiple or width % self.size_multiple:
             raise ValueError(f"image size {height} x {width} is no multiple of {self.size_multiple}")
-        required = require_priors(images, priors)
-        with torch.no_grad():
-            inputs = working_views(images, required, self.config)
-        features = self.network.features(inputs)
-        camera_vector, world_from_cam, intrinsics = self._cameras(features.camera_tokens, required, height, width)
+        return measure(priors, views, height, width, self.config)
 
+    @torch.no_grad()
+    def prepare(self, images: Float[Tensor, "view 3 height width"], measured: MeasuredPriors) -> PreparedViews:
+        """See `PreparesInputs.prepare`."""
+        return prepare(images, measured, self.config)
+
+    def predict_prepared(
+        self,
+        prepared: PreparedViews,
+        *,
+        heads: frozenset[Head] = ALL_HEADS,
+        generated: Bool[Tensor, "view"] | None = None,
+    ) -> Prediction:
+        """See `PreparesInputs.predict_prepared`."""
+        images, priors = prepared.images, prepared.priors
+        views, _, height, width = images.shape
+        features = self.network.features(prepared.working)
+        camera_vector, world_from_cam, intrinsics = self._cameras(
+            features.camera_tokens, priors, prepared.scale, height, width
+        )
         wants_depth = bool(heads & {Head.DEPTH, Head.POINTS, Head.GAUSSIANS})
         wants_normals = bool(heads & {Head.NORMALS, Head.GAUSSIANS})
         depth = depth_conf = normals = normals_conf = points = None
         gaussian_depth = gaussians = None
         if wants_depth:
-            depth, depth_conf = self._depth(self.network.depth_head(features.dense), required)
+            depth, depth_conf = self._depth(self.network.depth_head(features.dense), priors)
         if wants_normals:
             raw = self.network.normals_head(features.dense)
-            base = inputs.base_normals.movedim(-1, 1)
+            base = priors.base_normals.movedim(-1, 1)
             upsampled = _upsample(torch.cat([base + raw[:, :3], raw[:, 3:]], dim=1), height, width)
             rays = viewing_rays(intrinsics.detach(), height, width)
             normals = face_camera(upsampled[:, :3].movedim(1, -1), rays)
@@ -87,10 +108,10 @@ class Mini(nn.Module):
             flags = torch.zeros(views, dtype=torch.bool, device=images.device) if generated is None else generated
             transparent = covered_by_others(
                 depth,
-                required.confident,
+                priors.confident,
                 world_from_cam,
                 intrinsics,
-                required.posed,
+                priors.posed,
                 most_views=self.config.cross_views,
             )
             gaussians, gaussian_depth = pixel_aligned_gaussians(
@@ -151,12 +172,12 @@ class Mini(nn.Module):
         os.replace(scratch, path)
 
     def _cameras(
-        self, tokens: Float[Tensor, "view dim"], priors: RequiredPriors, height: int, width: int
+        self, tokens: Float[Tensor, "view dim"], priors: MeasuredPriors, scene_scale: float, height: int, width: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(camera vectors, world_from_cam, intrinsics): the priors, refined by the camera head in normalised scale."""
         poses = priors.world_from_cam
         scale = poses.new_ones(9)
-        scale[:3] = priors.scale
+        scale[:3] = scene_scale
         start = camera_vector_from_pose(poses, priors.intrinsics_px, height, width)
         refined = self.network.camera_head(tokens[None], (start / scale)[None])[-1][0] * scale
         # Adam moves every weight by about the learning rate, which adds up over the width of a linear layer: without this gain
@@ -174,7 +195,7 @@ class Mini(nn.Module):
         return vector, world_from_cam, priors.intrinsics_px * gain
 
     def _depth(
-        self, raw: Float[Tensor, "view 2 out_height out_width"], priors: RequiredPriors
+        self, raw: Float[Tensor, "view 2 out_height out_width"], priors: MeasuredPriors
     ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
         """(depth, confidence): log depth = log base + (1 - pull x confident) x residual."""
         limit = self.config.max_log_residual

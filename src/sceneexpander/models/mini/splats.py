@@ -13,7 +13,8 @@ from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.models.mini.config import MiniConfig
-from sceneexpander.models.mini.inputs import SAME_SURFACE, sample_other_views
+from sceneexpander.models.mini.inputs import SAME_SURFACE
+from sceneexpander.models.mini.pairs import sample_other_views
 from sceneexpander.models.pixel_aligned import SplatRule, pixel_aligned
 
 SPLAT_RESIDUALS = 4  # log scale along the slant, log scale across, opacity logit, log depth offset

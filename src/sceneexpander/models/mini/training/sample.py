@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool2d, normalize
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.geometry.rigid import rigid_inverse
-from sceneexpander.models.mini.inputs import sample_other_views
+from sceneexpander.models.mini.pairs import sample_other_views
 
 _SCHEMA = "mini-sample-1"
 _HIDDEN_BEHIND = 0.05  # log depth behind another view's surface at which a point counts as hidden

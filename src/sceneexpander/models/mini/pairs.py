@@ -1,0 +1,201 @@
+"""What other views say about each pixel's base depth: measured once per pair of views, whatever the pictures show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from sceneexpander.geometry.normals import viewing_rays
+from sceneexpander.geometry.rigid import rigid_inverse, transform_points
+
+CROSS_VIEW_CHANNELS = 6  # see `PairGeometry.compare`
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pairs:
+    """One view's points in other views, and the other views' points in it."""
+
+    grid: Float[Tensor, "other point 2"]  # where they project, for `grid_sample`
+    in_frame: Bool[Tensor, "other point"]
+    behind: Float[Tensor, "other point"]  # log ratio of their depth to what the other view has there, in [-1, 1]
+    weight: Float[Tensor, "other point"]  # confidence of what the other view has there, 0 out of frame
+    nearest: Float[Tensor, "other point"]  # log depth of the other's nearest confident point in each pixel, or infinite
+
+    @classmethod
+    def stacked(cls, parts: Sequence[Pairs]) -> Pairs:
+        """Several others as one."""
+        return cls(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+    def one(self, other: int) -> Pairs:
+        """A single other view."""
+        return Pairs(**{f.name: getattr(self, f.name)[other : other + 1] for f in fields(self)})
+
+
+class PairGeometry:
+    """Base depths of some views compared with one another; every pair is measured when it is first asked for, and kept.
+
+    Args:
+        log_depth: natural logarithm of the base depth, in the poses' scale.
+        confident: share of confident pixels.
+        world_from_cam: camera poses.
+        intrinsics_px: intrinsics at the resolution of the depth.
+        posed: views whose pose is only a placeholder take no part.
+    """
+
+    def __init__(
+        self,
+        log_depth: Float[Tensor, "view height width"],
+        confident: Float[Tensor, "view height width"],
+        world_from_cam: Float[Tensor, "view 4 4"],
+        intrinsics_px: Float[Tensor, "view 3 3"],
+        posed: Bool[Tensor, "view"],
+    ) -> None:
+        height, width = log_depth.shape[-2:]
+        points_cam = viewing_rays(intrinsics_px, height, width) * log_depth.exp()[..., None]
+        self.points_world = transform_points(world_from_cam, points_cam.flatten(1, 2))
+        self.cam_from_world = rigid_inverse(world_from_cam)
+        self.intrinsics_px = intrinsics_px
+        self.content = torch.stack([log_depth, confident], dim=1)
+        self.posed: list[bool] = posed.tolist()
+        centres = world_from_cam[:, :3, 3]
+        self.distances = (centres[:, None] - centres).square().sum(-1).tolist()
+        self._known: dict[tuple[int, int], Pairs] = {}
+
+    def neighbours(self, view: int, views: Sequence[int], most: int) -> list[int]:
+        """Those of ``views`` that ``view`` is compared with: at most ``most``, nearest cameras first."""
+        others = [other for other in views if other != view and self.posed[other]]
+        if not self.posed[view]:
+            return []
+        return sorted(others, key=lambda other: self.distances[view][other])[:most]
+
+    def pairs(self, view: int, others: Sequence[int]) -> Pairs:
+        """The comparison of one view with others."""
+        missing = [other for other in others if (view, other) not in self._known]
+        if missing:
+            found = self._measure(view, missing)
+            for index, other in enumerate(missing):
+                self._known[view, other] = found.one(index)
+        return Pairs.stacked([self._known[view, other] for other in others])
+
+    def _measure(self, view: int, others: Sequence[int]) -> Pairs:
+        chosen = torch.tensor(others, device=self.points_world.device)
+        height, width = self.content.shape[-2:]
+        grid, log_z, in_frame = project_to_views(
+            self.points_world[view], self.cam_from_world[chosen], self.intrinsics_px[chosen], height, width
+        )
+        seen = sample_at(self.content[chosen], grid)
+        nearest = [
+            splat_log_depth(
+                self.points_world[other][self.content[other, 1].flatten() > 0.5],
+                self.cam_from_world[view],
+                self.intrinsics_px[view],
+                height,
+                width,
+            ).flatten()
+            for other in others
+        ]
+        return Pairs(
+            grid=grid,
+            in_frame=in_frame,
+            behind=(log_z - seen[:, 0]).clamp(-1, 1),
+            weight=seen[:, 1] * in_frame,
+            nearest=torch.stack(nearest),
+        )
+
+    def compare(
+        self, images: Float[Tensor, "chosen 3 height width"], views: Sequence[int], *, most_views: int
+    ) -> Float[Tensor, "chosen 6 height width"]:
+        """What the other posed views say about each pixel's base depth; zeros where none says anything.
+
+        Channels: (0) smallest colour difference to any other view at the reprojection; (1) share of the other views that
+        have the point in frame; (2) how far behind, (3) how far in front of confident surfaces of other views it lies (mean
+        log ratio over them); (4) log of the nearest confident surface of other views seen in this pixel / base depth; (5)
+        whether there is one.
+
+        Args:
+            images: RGB of ``views``, at the resolution of the depth.
+            views: which of the views take part.
+            most_views: each view is compared with this many others at most, those with the nearest cameras.
+        """
+        height, width = self.content.shape[-2:]
+        out = images.new_zeros(len(views), CROSS_VIEW_CHANNELS, height * width)
+        place = {view: index for index, view in enumerate(views)}
+        for index, view in enumerate(views):
+            others = self.neighbours(view, views, most_views)
+            if not others:
+                continue
+            pairs = self.pairs(view, others)
+            seen = sample_at(images[[place[other] for other in others]], pairs.grid)
+            colour = (seen - images[index].flatten(1)).abs().mean(1)
+            out[index, 0] = torch.where(pairs.in_frame, colour, 1.0).amin(0) * pairs.in_frame.any(0)
+            out[index, 1] = pairs.in_frame.float().mean(0)
+            total = pairs.weight.sum(0).clamp(min=0.5)
+            out[index, 2] = (pairs.weight * pairs.behind.clamp(min=0)).sum(0) / total
+            out[index, 3] = (pairs.weight * (-pairs.behind).clamp(min=0)).sum(0) / total
+            nearest = pairs.nearest.amin(0)
+            found = nearest.isfinite()
+            out[index, 4] = torch.where(found, (nearest - self.content[view, 0].flatten()).clamp(-1, 1), 0.0)
+            out[index, 5] = found.float()
+        return torch.unflatten(out, -1, (height, width))
+
+
+def project_to_views(
+    points_world: Float[Tensor, "point 3"],
+    cam_from_world: Float[Tensor, "other 4 4"],
+    intrinsics_px: Float[Tensor, "other 3 3"],
+    height: int,
+    width: int,
+) -> tuple[Float[Tensor, "other point 2"], Float[Tensor, "other point"], Bool[Tensor, "other point"]]:
+    """(place for `sample_at`, log of the depth there, whether it is in frame) of points in other views."""
+    points = transform_points(cam_from_world, points_world.expand(len(cam_from_world), -1, -1))
+    depth = points[..., 2]
+    pixel = (points @ intrinsics_px.transpose(-1, -2))[..., :2] / depth.clamp(min=1e-6)[..., None]
+    grid = pixel / pixel.new_tensor([width / 2, height / 2]) - 1
+    in_frame = (depth > 1e-6) & (grid.abs() < 1).all(-1)
+    # Far outside coordinates would overflow the sampler's integers.
+    return grid.clamp(-2, 2), depth.clamp(min=1e-6).log(), in_frame
+
+
+def sample_at(
+    content: Float[Tensor, "other channel height width"], grid: Float[Tensor, "other point 2"]
+) -> Float[Tensor, "other channel point"]:
+    """Bilinear samples; outside the frame the border is repeated."""
+    sampled = functional.grid_sample(
+        content, grid[:, :, None], mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return sampled[..., 0]
+
+
+def sample_other_views(
+    points_world: Float[Tensor, "point 3"],
+    content: Float[Tensor, "other channel height width"],
+    cam_from_world: Float[Tensor, "other 4 4"],
+    intrinsics_px: Float[Tensor, "other 3 3"],
+) -> tuple[Float[Tensor, "other channel point"], Float[Tensor, "other point"], Bool[Tensor, "other point"]]:
+    """(content of other views where the points project, log of the points' depth there, whether they are in frame)."""
+    height, width = content.shape[-2:]
+    grid, log_z, in_frame = project_to_views(points_world, cam_from_world, intrinsics_px, height, width)
+    return sample_at(content, grid), log_z, in_frame
+
+
+def splat_log_depth(
+    points_world: Float[Tensor, "point 3"],
+    cam_from_world: Float[Tensor, "4 4"],
+    intrinsics_px: Float[Tensor, "3 3"],
+    height: int,
+    width: int,
+) -> Float[Tensor, "height width"]:
+    """Log depth of the nearest point that falls in each pixel, infinite where there is none."""
+    points = transform_points(cam_from_world, points_world)
+    depth = points[:, 2]
+    pixel = (points @ intrinsics_px.T)[:, :2] / depth.clamp(min=1e-6)[:, None]
+    column, row = pixel.floor().long().unbind(-1)
+    kept = (depth > 1e-6) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    nearest = depth.new_full((height * width,), torch.inf)
+    index = (row * width + column)[kept]
+    return nearest.scatter_reduce(0, index, depth[kept].log(), reduce="amin").view(height, width)
