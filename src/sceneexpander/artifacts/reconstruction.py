@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.artifacts.store import ArtifactError, load_artifact, require_tensor, save_artifact
-from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.gaussians import GaussianCounts, Gaussians
 
 SCHEMA = "reconstruction/1"
 _VIEW_TENSORS = ("camera_vector", "world_from_cam", "intrinsics_px", "depth", "depth_conf", "normals", "normals_conf")
@@ -20,7 +20,8 @@ _VIEW_TENSORS = ("camera_vector", "world_from_cam", "intrinsics_px", "depth", "d
 class Reconstruction:
     """S views of H x W pixels. World frame: approximately the first view's camera (OpenCV axes), scene units.
 
-    ``posed`` tells which cameras were really estimated (False: a placeholder was used).
+    ``posed`` tells which cameras were really estimated (False: a placeholder was used), ``counts`` what became of the Gaussians that
+    the model made (None: not recorded).
     """
 
     method: str
@@ -37,6 +38,7 @@ class Reconstruction:
     normals: Float[Tensor, "view height width 3"]
     normals_conf: Float[Tensor, "view height width"]
     gaussians: Gaussians
+    counts: GaussianCounts | None = None
 
     def __post_init__(self) -> None:
         for name in _VIEW_TENSORS:
@@ -54,6 +56,7 @@ class Reconstruction:
         tensors = {name: getattr(self, name) for name in (*_VIEW_TENSORS, "generated", "posed")}
         tensors |= {f"gaussians.{f.name}": getattr(self.gaussians, f.name) for f in fields(Gaussians)}
         facts = {name: getattr(self, name) for name in ("method", "model", "weights_sha256", "view_ids")}
+        facts["counts"] = None if self.counts is None else asdict(self.counts)
         save_artifact(folder, SCHEMA, facts, tensors)
 
     @classmethod
@@ -71,7 +74,8 @@ class Reconstruction:
                 weights_sha256=facts["weights_sha256"],
                 view_ids=tuple(facts["view_ids"]),
                 gaussians=gaussians,
+                counts=None if facts.get("counts") is None else GaussianCounts(**facts["counts"]),
                 **views,
             )
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise ArtifactError(f"is invalid ({error})", where=folder, fix="rerun the stage that makes it") from None

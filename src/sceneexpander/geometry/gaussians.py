@@ -50,6 +50,29 @@ class Gaussians:
         return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GaussianCounts:
+    """What became of the Gaussians that a model made; nothing else is ever dropped: ``made = filtered + merged + kept``."""
+
+    made: int  # one per pixel of every view
+    filtered: int = 0  # left out by the model's own confidence filter
+    merged: int = 0  # gone into another one of the same voxel
+    kept: int
+
+    def __post_init__(self) -> None:
+        if min(self.filtered, self.merged, self.kept) < 0 or self.made != self.filtered + self.merged + self.kept:
+            raise ValueError(f"{self.made} Gaussians cannot be {self.filtered} + {self.merged} + {self.kept}")
+
+    def line(self) -> str:
+        """For people, e.g. "1000 Gaussians made, 300 left out by the confidence filter, 200 merged into others, 500 kept"."""
+        told = [f"{self.made} Gaussians made"]
+        if self.filtered:
+            told.append(f"{self.filtered} left out by the confidence filter")
+        if self.merged:
+            told.append(f"{self.merged} merged into others of the same voxel")
+        return ", ".join([*told, f"{self.kept} kept"])
+
+
 def concatenate(parts: list[Gaussians]) -> Gaussians:
     """All Gaussians of the parts, in order."""
     if not parts:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+
 import torch
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.geometry.gaussians import GaussianCounts
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.protocol import Prediction
+
+_log = logging.getLogger(__name__)
 
 
 def as_reconstruction(
@@ -24,6 +29,9 @@ def as_reconstruction(
     missing = [name for name, value in parts.items() if value is None]
     if missing:
         raise ValueError(f"{model} gave no {', '.join(missing)}")
+    kept = len(parts["gaussians"])
+    counts = prediction.gaussian_counts or GaussianCounts(made=kept, kept=kept)
+    _log.info("%s: %s", method, counts.line())
     posed = torch.ones(len(views), dtype=torch.bool) if priors.posed is None else priors.posed
     return Reconstruction(
         method=method,
@@ -35,5 +43,6 @@ def as_reconstruction(
         camera_vector=prediction.camera_vector.cpu(),
         world_from_cam=prediction.world_from_cam.cpu(),
         intrinsics_px=prediction.intrinsics_px.cpu(),
+        counts=counts,
         **{name: value.to("cpu") for name, value in parts.items() if value is not None},
     )

@@ -10,7 +10,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.gaussians import GaussianCounts, Gaussians
 from sceneexpander.geometry.priors import Priors
 
 
@@ -46,6 +46,7 @@ class Prediction:
     points_conf: Float[Tensor, "view height width"] | None = None
     gaussian_depth: Float[Tensor, "view height width"] | None = None  # depth that placed the Gaussians
     gaussians: Gaussians | None = None  # after the model's own merge
+    gaussian_counts: GaussianCounts | None = None  # None: one Gaussian per pixel, all kept
 
 
 @runtime_checkable

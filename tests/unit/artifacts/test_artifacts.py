@@ -12,6 +12,7 @@ from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.store import ArtifactError, directory_being_written, sha256_of_tensors
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
+from sceneexpander.geometry.gaussians import GaussianCounts
 from sceneexpander.geometry.priors import Priors
 from tests.support.tiny_model import TinyReconstructor, tiny_images
 
@@ -52,6 +53,7 @@ def make_reconstruction() -> Reconstruction:
         normals=p.normals,
         normals_conf=p.normals_conf,
         gaussians=p.gaussians,
+        counts=GaussianCounts(made=len(p.gaussians) + 5, merged=5, kept=len(p.gaussians)),
     )
 
 
@@ -91,6 +93,7 @@ def test_reconstruction_round_trip_is_exact(tmp_path: Path) -> None:
     for name in ("camera_vector", "depth", "normals", "generated"):
         assert torch.equal(getattr(back, name), getattr(original, name))
     assert torch.equal(back.gaussians.means, original.gaussians.means)
+    assert back.counts == original.counts
     assert back.gaussians.generated.sum() == len(original.gaussians) // 2
 
 

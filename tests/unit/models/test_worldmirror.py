@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sceneexpander.geometry.camera import intrinsics_from_parts
+from sceneexpander.geometry.gaussians import GaussianCounts
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import look_at
 from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Prediction, Reconstructor
@@ -251,6 +252,23 @@ def test_confidence_filter_keeps_the_surest_share() -> None:
     by_view = torch.bincount(output.merged[0].source_view, minlength=2)
     threshold = output.conf.flatten().sort(descending=True).values[kept - 1]
     assert by_view.tolist() == (output.conf[0] >= threshold).flatten(1).sum(1).tolist()
+
+
+def test_every_gaussian_that_is_gone_is_counted() -> None:
+    # Voxels as wide as the scene: what the filter leaves falls into a handful of them.
+    config = replace(TINY, gaussian=GaussianConfig(hidden=8, voxel_size=0.5, confidence_filter=True))
+    prediction = tiny_worldmirror(config=config).predict(random_images(2))
+    counts = prediction.gaussian_counts
+    assert counts is not None
+    assert (counts.made, counts.filtered) == (2 * 28 * 42, 2 * 28 * 42 - 1647)
+    assert counts.kept == len(prediction.gaussians) < 1647
+    assert counts.merged == 1647 - counts.kept
+    assert counts.line() == (
+        f"2352 Gaussians made, 705 left out by the confidence filter, {counts.merged} merged into others of the same voxel, "
+        f"{counts.kept} kept"
+    )
+    with pytest.raises(ValueError, match=r"10 Gaussians cannot be 1 \+ 2 \+ 3"):
+        GaussianCounts(made=10, filtered=1, merged=2, kept=3)
 
 
 def test_novel_view_protocol_builds_gaussians_from_the_context_alone(model: WorldMirror) -> None:

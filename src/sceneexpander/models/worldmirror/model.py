@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.gaussians import GaussianCounts, Gaussians
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.layers.activations import confidence, unit_vector
 from sceneexpander.models.layers.backbone import TrunkFeatures
@@ -48,6 +48,7 @@ class GaussianOutput:
     conf: Map
     pixels: PixelGaussians
     merged: list[Gaussians]
+    counts: list[GaussianCounts]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,14 +207,19 @@ class WorldMirror(BackboneModel):
             pixels, source = pixels.select(kept), source.gather(1, kept)
         if generated is None:
             generated = torch.zeros(batch, views, dtype=torch.bool, device=images.device)
-        made = generated.gather(1, source)
+        by_generation = generated.gather(1, source)
         merged = [
-            merge_voxels(pixels, b, voxel_size=config.voxel_size, source_view=source[b], generated=made[b])
+            merge_voxels(pixels, b, voxel_size=config.voxel_size, source_view=source[b], generated=by_generation[b])
             if config.merge
-            else unmerged(pixels, b, source_view=source[b], generated=made[b])
+            else unmerged(pixels, b, source_view=source[b], generated=by_generation[b])
             for b in range(batch)
         ]
-        return GaussianOutput(depth=depth, conf=conf, pixels=pixels, merged=merged)
+        made, left = conf[0].numel(), pixels.means.shape[1]
+        counts = [
+            GaussianCounts(made=made, filtered=made - left, merged=left - len(scene), kept=len(scene))
+            for scene in merged
+        ]
+        return GaussianOutput(depth=depth, conf=conf, pixels=pixels, merged=merged, counts=counts)
 
 
 def batch_priors(priors: Priors | None) -> BatchPriors | None:
@@ -249,4 +255,5 @@ def _first_scene(batch: BatchPrediction) -> Prediction:
         points_conf=first(batch.points_conf),
         gaussian_depth=None if splats is None else splats.depth[0],
         gaussians=None if splats is None else splats.merged[0],
+        gaussian_counts=None if splats is None else splats.counts[0],
     )
