@@ -82,19 +82,25 @@ class _ViewState:
 
 @functools.cache
 def load_kernel() -> _Kernel | None:
-    """The library for this CPU, or None where the install could not build one (said once in the log)."""
+    """The best library for this CPU, or None where the install could not build one (said once in the log)."""
     for build in BUILDS.get(torch.backends.cpu.get_cpu_capability(), ("plain",)):
-        for path in sorted(KERNEL_DIRECTORY.glob(f"_rasteriser_{build}.*")):
-            try:
-                kernel = _Kernel(path)
-            except (OSError, AttributeError) as error:
-                logger.warning("rasteriser: cannot use %s (%s)", path.name, error)
-                continue
-            logger.info("rasteriser: compiled CPU kernel %s", path.name)
+        kernel = open_build(build)
+        if kernel is not None:
+            logger.info("rasteriser: compiled CPU kernel %s", kernel.path.name)
             return kernel
     logger.warning(
         "rasteriser: no compiled kernel beside the package, using torch (slower); install again with a C++ compiler"
     )
+    return None
+
+
+def open_build(build: str) -> _Kernel | None:
+    """One of the libraries that the install may have built (a name in `BUILDS`); the CPU must know its instructions."""
+    for path in sorted(KERNEL_DIRECTORY.glob(f"_rasteriser_{build}.*")):
+        try:
+            return _Kernel(path)
+        except (OSError, AttributeError) as error:
+            logger.warning("rasteriser: cannot use %s (%s)", path.name, error)
     return None
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sceneexpander.geometry.gaussians import Gaussians, concatenate
 from sceneexpander.geometry.rigid import look_at, quat_wxyz_from_rotation, rigid_inverse, rotation_from_quat_wxyz
-from sceneexpander.splatting import RasterSettings, Render, rasterise, render, render_normals
+from sceneexpander.splatting import RasterSettings, Render, kernel_backend, rasterise, render, render_normals
 from sceneexpander.splatting.kernel_backend import load_kernel
 from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
 
@@ -103,6 +103,25 @@ def test_kernel_agrees_with_the_torch_oracle(sh_coefficients: int, antialiased: 
     for name, expected in slopes[1].items():
         error = (slopes[0][name] - expected).norm() / expected.norm()
         assert error < 1e-4, f"{name}: relative L2 {error:.1e}"  # the fixtures' tolerance for float32 gradients
+
+
+@needs_kernel
+@pytest.mark.parametrize("build", ["v3", "v4", "plain"])
+def test_every_build_draws_the_same(build: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = kernel_backend.BUILDS.get(torch.backends.cpu.get_cpu_capability(), ("plain",))
+    kernel = kernel_backend.open_build(build) if build in known else None
+    if kernel is None:
+        pytest.skip(f"no {build} here")
+    monkeypatch.setattr(kernel_backend, "load_kernel", lambda: kernel)
+    scene, poses, k = random_gaussians(400, sh_coefficients=9), cameras(2), intrinsics(2, H, W)
+    ours, exact = (render(scene, poses, k, H, W, settings=settings(backend)) for backend in ("cpu", "torch"))
+    assert_same_pictures(ours, exact, tolerance=2e-5)
+    for (name, slope), expected in zip(
+        gradients(scene, poses, settings("cpu")).items(),
+        gradients(scene, poses, settings("torch")).values(),
+        strict=True,
+    ):
+        assert (slope - expected).norm() < 1e-4 * expected.norm(), name
 
 
 @needs_kernel

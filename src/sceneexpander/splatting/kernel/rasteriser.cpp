@@ -4,13 +4,14 @@
 //   project   every Gaussian once -> a compact record, a tile rectangle and a depth key
 //   order     stable radix sort of the Gaussians (not of the intersections) by the bits of their depth
 //   bin       stable counting sort of the ordered Gaussians into tiles, in bands of tile rows when memory would not do
-//   blend     per tile, front to back: windows of kLanes pixels over the rows of a Gaussian's box
+//   blend     per tile, front to back: windows of kColumns x kRows pixels over a Gaussian's box
 //   backward  per tile, front to back again, each (Gaussian, tile) pair writes sums into a slot of its own;
 //             then per Gaussian, the slots are summed in a fixed order and carried through the projection
 // Nothing depends on how work was dealt to threads: the results are the same bits for every thread count.
 //
-// Pixels of a tile live in rows padded by one window, so that a window may start at any column. A pixel that takes no more
-// light has a transmittance <= 0, so the padding (0) and finished pixels (negated) need no mask.
+// Pixels of a tile live in rows padded by one window, so that a window may start at any column. Where a window covers two rows,
+// these lie interleaved pixel by pixel: most boxes are about eight pixels wide, and half of a vector of sixteen would be wasted on
+// one row. A pixel that takes no more light has a transmittance <= 0, so padding (0) and finished pixels (negated) need no mask.
 //
 // Vectors are GCC/Clang vector types of the machine's own width: loops over bool masks are not vectorised reliably.
 
@@ -43,10 +44,13 @@ typedef int32_t Mask __attribute__((vector_size(4 * kLanes)));
 
 constexpr int kTileW = 16;
 constexpr int kTileH = 16;
-constexpr int kStride = kTileW + kLanes;  // of a row of tile pixels, see above
-constexpr int kPixels = kTileH * kStride;
+constexpr int kRows = kLanes == 16 ? 2 : 1;  // of a window
+constexpr int kColumns = kLanes / kRows;
+constexpr int kStride = (kTileW + kColumns) * kRows;  // from one group of kRows rows of tile pixels to the next, see above
+constexpr int kPixels = kTileH / kRows * kStride;
 constexpr int kMoments = 6;        // sums over pixels: v, v dx, v dy, v dx^2, v dx dy, v dy^2
 constexpr int kDoneEvery = 16;     // Gaussians between two tests whether a tile is finished
+constexpr int kAhead = 8;          // Gaussians by which records are fetched ahead: a tile's lie all over memory
 constexpr int kChunk = 2048;       // Gaussians per unit of work; fixed, so that partial sums do not depend on threads
 constexpr float kMinAlpha = 1.0f / 255.0f;
 constexpr float kMinTransmittance = 1e-4f;
@@ -66,9 +70,15 @@ SX_INLINE Vec load(const float* p) {
 SX_INLINE void store(float* p, Vec v) { std::memcpy(p, &v, sizeof v); }
 SX_INLINE Vec splat(float x) { return Vec{} + x; }
 SX_INLINE Vec keep(Mask mask, Vec v) { return (Vec)((Mask)v & mask); }  // v where the mask holds, else 0
-SX_INLINE Vec iota() {
+SX_INLINE int pixel_at(int x, int y) { return y / kRows * kStride + x * kRows + y % kRows; }  // in a tile
+SX_INLINE Vec column_of_lane() {
   Vec v{};
-  for (int lane = 0; lane < kLanes; ++lane) v[lane] = static_cast<float>(lane);
+  for (int lane = 0; lane < kLanes; ++lane) v[lane] = static_cast<float>(lane / kRows);
+  return v;
+}
+SX_INLINE Vec row_of_lane() {
+  Vec v{};
+  for (int lane = 0; lane < kLanes; ++lane) v[lane] = static_cast<float>(lane % kRows);
   return v;
 }
 SX_INLINE float lane_sum(Vec v) {
@@ -536,7 +546,8 @@ TileArea tile_area(const SxScene& s, int column, int row) {
 
 void start_transmittance(const TileArea& area, float* t) {
   std::fill(t, t + kPixels, 0.0f);
-  for (int y = 0; y < area.h; ++y) std::fill(t + y * kStride, t + y * kStride + area.w, 1.0f);
+  for (int y = 0; y < area.h; ++y)
+    for (int x = 0; x < area.w; ++x) t[pixel_at(x, y)] = 1.0f;
 }
 
 bool finished(const float* t) {
@@ -550,29 +561,35 @@ bool finished(const float* t) {
   return *std::max_element(lanes, lanes + kLanes) <= 0.0f;
 }
 
-// The part of a Gaussian's box inside a tile, and its value along one window of columns.
+// A Gaussian along one window of columns.
 struct Window {
   Vec dx, q0, q1;
 
   template <int NC>
   SX_INLINE Window(const Record<NC>& g, int x)
-      : dx(iota() + (static_cast<float>(x) + 0.5f - g.u)), q0(dx * dx * g.qa), q1(dx * g.qb) {}
+      : dx(column_of_lane() + (static_cast<float>(x) + 0.5f - g.u)), q0(dx * dx * g.qa), q1(dx * g.qb) {}
 };
 
+// The part of a Gaussian's box inside a tile, in tile pixels; its first row is one that a window may start at.
 struct Box {
-  int x0, x1, y0, y1;  // in tile pixels
+  int x0, x1, y0, y1;
 
   template <int NC>
   SX_INLINE Box(const Record<NC>& g, const TileArea& a)
       : x0(std::max(g.x0 - a.x, 0)),
         x1(std::min(g.x1 - a.x, kTileW)),
-        y0(std::max(g.y0 - a.y, 0)),
+        y0(std::max(g.y0 - a.y, 0) / kRows * kRows),
         y1(std::min(g.y1 - a.y, kTileH)) {}
 };
 
-// Uncapped alpha of a window in one row, 0 where the pair is skipped. Both passes must take the same decisions: one function.
 template <int NC>
-SX_INLINE Vec alpha_of(const Record<NC>& g, const Window& window, float dy) {
+SX_INLINE Vec first_dy(const Record<NC>& g, const TileArea& a, const Box& box) {
+  return row_of_lane() + (static_cast<float>(a.y + box.y0) + 0.5f - g.v);
+}
+
+// Uncapped alpha of a window, 0 where the pair is skipped. Both passes must take the same decisions: one function.
+template <int NC>
+SX_INLINE Vec alpha_of(const Record<NC>& g, const Window& window, Vec dy) {
   const Vec power = window.q0 + dy * (window.q1 + g.qc * dy);
   const Vec exponent = power + g.level;
   const Mask seen = (power <= 0.0f) & (exponent >= -7.99435343685886f);  // log2(1/255)
@@ -588,13 +605,15 @@ void blend_tile(const SxScene& s, const Record<NC>* records, const uint32_t* ent
   std::memset(colour, 0, sizeof colour);
   for (size_t i = 0; i < n; ++i) {
     if (i % kDoneEvery == 0 && i > 0 && finished(t)) break;
+    if (i + kAhead < n) __builtin_prefetch(&records[entries[i + kAhead]]);
     const Record<NC>& g = records[entries[i]];
     const Box box(g, area);
-    for (int x = box.x0; x < box.x1; x += kLanes) {
+    for (int x = box.x0; x < box.x1; x += kColumns) {
       const Window window(g, area.x + x);
-      for (int y = box.y0; y < box.y1; ++y) {
-        const int at = y * kStride + x;
-        Vec alpha = alpha_of(g, window, static_cast<float>(area.y + y) + 0.5f - g.v);
+      Vec dy = first_dy(g, area, box);
+      for (int y = box.y0; y < box.y1; y += kRows, dy += static_cast<float>(kRows)) {
+        const int at = pixel_at(x, y);
+        Vec alpha = alpha_of(g, window, dy);
         alpha = alpha < s.max_alpha ? alpha : splat(s.max_alpha);
         const Vec before = load(t + at);
         const Vec after = before * (1.0f - alpha);
@@ -609,8 +628,9 @@ void blend_tile(const SxScene& s, const Record<NC>* records, const uint32_t* ent
   const int64_t plane = static_cast<int64_t>(s.width) * s.height;
   for (int y = 0; y < area.h; ++y) {
     const int64_t to = static_cast<int64_t>(area.y + y) * s.width + area.x;
-    for (int x = 0; x < area.w; ++x) transmittance[to + x] = std::abs(t[y * kStride + x]);
-    for (int c = 0; c < channels_of(s); ++c) std::memcpy(planes + c * plane + to, &colour[c][y * kStride], 4 * area.w);
+    for (int x = 0; x < area.w; ++x) transmittance[to + x] = std::abs(t[pixel_at(x, y)]);
+    for (int c = 0; c < std::min(NC, channels_of(s)); ++c)
+      for (int x = 0; x < area.w; ++x) planes[c * plane + to + x] = colour[c][pixel_at(x, y)];
   }
 }
 
@@ -648,8 +668,10 @@ View* forward(const SxScene& s, float* planes, float* transmittance, float* radi
 // Loads one tile of an image plane into padded tile rows.
 void load_tile(const float* plane, int width, const TileArea& area, float* tile) {
   std::fill(tile, tile + kPixels, 0.0f);
-  for (int y = 0; y < area.h; ++y)
-    std::memcpy(tile + y * kStride, plane + static_cast<int64_t>(area.y + y) * width + area.x, 4 * area.w);
+  for (int y = 0; y < area.h; ++y) {
+    const float* row = plane + static_cast<int64_t>(area.y + y) * width + area.x;
+    for (int x = 0; x < area.w; ++x) tile[pixel_at(x, y)] = row[x];
+  }
 }
 
 struct Upstream {  // images and the loss's gradients with respect to them
@@ -659,9 +681,9 @@ struct Upstream {  // images and the loss's gradients with respect to them
 // With w = T alpha and S = sum of w (c . dC) over the Gaussians behind - dA T_final:
 //   dL/dalpha = T (c . dC) - S / (1 - alpha);  S starts as C . dC - dA T_final and loses each Gaussian as it passes.
 // A slot receives the six moments of v = alpha dL/dalpha over the pixels, then dL/dfeature.
-template <int NC, class SlotOf>
+template <int NC, class SlotOf, class Fetch>
 void blend_tile_backward(const SxScene& s, const Record<NC>* records, const uint32_t* entries, size_t n,
-                         const TileArea& area, const Upstream& up, const SlotOf& slot_of) {
+                         const TileArea& area, const Upstream& up, const SlotOf& slot_of, const Fetch& fetch) {
   alignas(64) float t[kPixels], rest[kPixels];
   alignas(64) float d_colour[NC][kPixels];
   alignas(64) float scratch[kPixels];
@@ -682,15 +704,16 @@ void blend_tile_backward(const SxScene& s, const Record<NC>* records, const uint
   size_t i = 0;
   for (; i < n; ++i) {
     if (i % kDoneEvery == 0 && i > 0 && finished(t)) break;
+    if (i + 2 * kAhead < n) fetch(entries[i + 2 * kAhead]);
+    if (i + kAhead < n) __builtin_prefetch(slot_of(entries[i + kAhead]), 1);
     const Record<NC>& g = records[entries[i]];
     const Box box(g, area);
     Vec moments[kMoments] = {}, d_feature[NC] = {};
-    for (int x = box.x0; x < box.x1; x += kLanes) {
+    for (int x = box.x0; x < box.x1; x += kColumns) {
       const Window window(g, area.x + x);
-      Vec m0{}, m1{}, m2{};
-      for (int y = box.y0; y < box.y1; ++y) {
-        const int at = y * kStride + x;
-        const float dy = static_cast<float>(area.y + y) + 0.5f - g.v;
+      Vec m0{}, m1{}, m2{}, dy = first_dy(g, area, box);
+      for (int y = box.y0; y < box.y1; y += kRows, dy += static_cast<float>(kRows)) {
+        const int at = pixel_at(x, y);
         const Vec raw = alpha_of(g, window, dy);
         const Mask free = raw < s.max_alpha;
         Vec alpha = free ? raw : splat(s.max_alpha);
@@ -868,13 +891,16 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
     slots = uninitialised<float>(total * kSlot);
     parallel_for(s.threads, static_cast<int64_t>(row1 - row0) * view.tiles_x, [&](int64_t tile) {
       const int column = static_cast<int>(tile % view.tiles_x), row = row0 + static_cast<int>(tile / view.tiles_x);
+      auto fetch = [&](uint32_t g) {
+        __builtin_prefetch(&view.records[g]), __builtin_prefetch(&view.rects[g]), __builtin_prefetch(&offset[g]);
+      };
       auto slot_of = [&](uint32_t g) {
         const Rect& r = view.rects[g];
         const uint64_t within = static_cast<uint64_t>(row - std::max<int>(r.y0, row0)) * (r.x1 - r.x0) + column - r.x0;
         return slots.get() + (offset[g] + within) * kSlot;
       };
       blend_tile_backward<NC>(s, view.records.get(), bins.entries.get() + bins.start[tile],
-                              bins.start[tile + 1] - bins.start[tile], tile_area(s, column, row), up, slot_of);
+                              bins.start[tile + 1] - bins.start[tile], tile_area(s, column, row), up, slot_of, fetch);
     });
     if (banded) each_gaussian([&](int64_t g, int64_t) { add_slots(g, carried.data() + g * kSlot); });
   }
