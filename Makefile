@@ -10,7 +10,7 @@ export MLFLOW_DISABLE_TELEMETRY := true
 export MLFLOW_SERVER_ENABLE_JOB_EXECUTION := false
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: repro test test-all test-unit test-conformance test-pipeline lint setup ui view expand ablate mini-scores clean help
+.PHONY: repro test test-all test-unit test-conformance test-pipeline lint setup ui view expand ablation mini-scores clean help
 
 help: ## What there is
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -63,8 +63,8 @@ expand: .venv/.stamp ## Expand your own photos: PHOTOS=, INSERTED=, PROMPT=, NAM
 	@test -n "$$PHOTOS" || { echo 'error: PHOTOS: is missing; make expand PHOTOS=folder INSERTED=picture PROMPT="..."' >&2; exit 2; }
 	$(PY) -m sceneexpander.expand "$$PHOTOS" $(if $(INSERTED),--inserted "$$INSERTED") $(if $(PROMPT),--prompt "$$PROMPT") $(if $(NAME),--name "$$NAME") $(ARGS)
 
-ablate: .venv/.stamp ## The rows of the paper's ablation table, as one sweep
-	$(PY) -m sceneexpander.sweep --multirun ablation=baseline,anchor,subset_aug,self_distill,self_distill_p1,full
+ablation: .venv/.stamp ## The rows of the paper's ablation table, controls and more, against known truth: ARGS=
+	$(PY) -m sceneexpander.ablation $(ARGS)
 
 mini-scores: .venv/.stamp ## Errors of the embedded reconstructor on made scenes
 	$(PY) scripts/mini_scores.py

@@ -38,6 +38,22 @@ class SubsetRule(StrEnum):
     ALL = "all"
 
 
+class InsertedWeights(StrEnum):
+    """How much each pixel of the inserted view counts in Eq. (gen): all alike (the paper), or by agreement and confidence."""
+
+    UNIFORM = "uniform"
+    CONSISTENT = "consistent"
+
+
+class Realign(StrEnum):
+    """What happens to the front-end's estimate before the adaptation: nothing; captured views keep what was known of them before
+    the insertion and the inserted one follows; or the inserted camera is also refined against the captured scene."""
+
+    NONE = "none"
+    HOLD = "hold"
+    REFINE = "refine"
+
+
 class Precision(StrEnum):
     """Precision of forward passes; weights, EMA and optimiser state are always float32."""
 
@@ -114,6 +130,15 @@ class AdaptConfig:
     drift: DriftForm = DriftForm.SUM
     gauge: Gauge = Gauge.KEEP_FIRST
     subset: SubsetRule = SubsetRule.PAPER
+    # Beyond the paper: see the modules photometric, consistency and realign.
+    lambda_splat: float = (
+        0.0  # weight of the captured photos against what the Gaussians of all views show there; 0: off
+    )
+    splat_every: int = 2  # steps between two such comparisons
+    splat_others: float = 0.5  # weight of the same without the view's own Gaussians
+    inserted_weights: InsertedWeights = InsertedWeights.UNIFORM
+    realign: Realign = Realign.NONE
+    trust: bool = False  # generated Gaussians fade where captured views contradict them, see `consistency.trusted`
     warp_targets: bool = False  # move the anchors of a warped view with its pixels
     precision: Precision = Precision.FP32
     checkpoint_every: int = 25  # steps between resume points; 0: none
@@ -129,6 +154,9 @@ class AdaptConfig:
             (0 <= self.restore_rate <= 1, f"restore_rate must be in [0, 1], is {self.restore_rate}"),
             (self.restore_interval >= 0, f"restore_interval must be >= 0, is {self.restore_interval}"),
             (self.camera_huber > 0, f"camera_huber must be > 0, is {self.camera_huber}"),
+            (self.lambda_splat >= 0, f"lambda_splat must be >= 0, is {self.lambda_splat}"),
+            (self.splat_every >= 1, f"splat_every must be >= 1, is {self.splat_every}"),
+            (self.splat_others >= 0, f"splat_others must be >= 0, is {self.splat_others}"),
         ]
         for fine, message in problems:
             if not fine:

@@ -13,11 +13,13 @@ import torch
 from torch import Tensor
 
 from sceneexpander.adaptation.checkpoint import Checkpoint
-from sceneexpander.adaptation.config import AdaptConfig, DriftForm, Precision
+from sceneexpander.adaptation.config import AdaptConfig, DriftForm, InsertedWeights, Precision
+from sceneexpander.adaptation.consistency import inserted_weights
 from sceneexpander.adaptation.inputs import AdaptationInputs, StepViews, ViewSource, geometry_of, run_key
 from sceneexpander.adaptation.ledger import WeightLedger, teacher_of
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import NonFiniteLoss, anchor_targets, step_losses
+from sceneexpander.adaptation.photometric import learn_from_photo
 from sceneexpander.adaptation.sampling import sample_batch
 from sceneexpander.models.protocol import Reconstructor, as_module
 
@@ -40,6 +42,7 @@ class StepRecord:
     gen_camera: float
     gen_depth: float
     gen_normal: float
+    splat: float  # colour error of the rendered captured view, 0 in steps that render none; see `photometric`
     drift: float  # L_reg before lambda_reg
     gradient_norm: float
     restored: int
@@ -122,13 +125,20 @@ class Run:
         batch = sample_batch(self.inputs.captured.shape[0], config, seed=self.seed, step=step)
         views = self.source.views(batch, step)
         # First the teacher: its activations are gone when the student's, which are kept, are made.
-        teacher = self._teach(views, len(batch.captured)) if batch.inserted else None
+        teacher, weights = self._teach(views, batch.captured) if batch.inserted else (None, None)
         with self._autocast():
             student = geometry_of(views.predict(self.model))
         targets = anchor_targets(self.anchors, batch, views.grids, student, config)
-        losses = step_losses(student, targets, teacher, config)
+        losses = step_losses(student, targets, teacher, config, weights)
         values = losses.values(step)
         losses.objective.backward()  # type: ignore[no-untyped-call]
+        del student, losses
+        splat = 0.0
+        if config.lambda_splat > 0 and step % config.splat_every == 0:
+            with self._autocast():
+                splat = learn_from_photo(
+                    self.model, self.inputs, config, inserted=batch.inserted, seed=self.seed, step=step
+                )
         done = self.ledger.update(step)
         if not math.isfinite(done.gradient):
             raise NonFiniteLoss(f"the gradient is not finite at step {step}")
@@ -137,18 +147,24 @@ class Run:
             step=step,
             captured=len(batch.captured),
             inserted=batch.inserted,
-            loss=values.pop("objective") + config.lambda_reg * drift,
+            loss=values.pop("objective") + config.lambda_splat * splat + config.lambda_reg * drift,
+            splat=splat,
             drift=drift,
             gradient_norm=done.gradient,
             restored=done.restored,
             **values,
         )
 
-    def _teach(self, views: StepViews, captured: int) -> ViewGeometry:
-        """The EMA teacher's prediction of the inserted view, from the step's very views."""
+    def _teach(self, views: StepViews, captured: tuple[int, ...]) -> tuple[ViewGeometry, Tensor | None]:
+        """The EMA teacher's prediction of the inserted view, from the step's very views, and how its pixels count (None: alike)."""
         with torch.inference_mode(), self._autocast():
-            taught = geometry_of(views.predict(self.teacher)).view(captured)
-        return taught.clone()  # as ordinary tensors, which a loss may keep
+            prediction = views.predict(self.teacher)
+            taught = geometry_of(prediction).view(len(captured))
+            weights = None
+            if self.config.inserted_weights is InsertedWeights.CONSISTENT:
+                weights = inserted_weights(prediction, self.anchors.depth[list(captured)])
+        # As ordinary tensors, which a loss may keep.
+        return taught.clone(), None if weights is None else weights.clone()
 
     def _autocast(self) -> torch.autocast:
         device = self.inputs.captured.device.type

@@ -75,31 +75,50 @@ def depth_distance(
     predicted: Float[Tensor, "view height width"],
     target: Float[Tensor, "view height width"],
     kind: DepthDistance,
+    weights: Float[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view"]:
     """d_D: mean absolute difference, in scene units; or the scale-invariant log error (standard deviation of the log ratio)."""
     if kind is DepthDistance.L1:
-        return (predicted - target).abs().mean((-2, -1))
+        return _mean((predicted - target).abs(), weights)
     log_ratio = predicted.log() - target.log()
-    variance = log_ratio.square().mean((-2, -1)) - log_ratio.mean((-2, -1)).square()
+    variance = _mean(log_ratio.square(), weights) - _mean(log_ratio, weights).square()
     # The square root has no derivative at 0, which is where an unadapted student starts.
     return (variance.clamp(min=0) + 1e-8).sqrt() - 1e-4
 
 
 def normal_distance(
-    predicted: Float[Tensor, "view height width 3"], target: Float[Tensor, "view height width 3"]
+    predicted: Float[Tensor, "view height width 3"],
+    target: Float[Tensor, "view height width 3"],
+    weights: Float[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view"]:
     """d_N: mean of 1 - cosine. Inputs are unit vectors."""
-    return (1 - (predicted * target).sum(-1)).mean((-2, -1))
+    return _mean(1 - (predicted * target).sum(-1), weights)
+
+
+def _mean(
+    values: Float[Tensor, "view height width"], weights: Float[Tensor, "view height width"] | None
+) -> Float[Tensor, "view"]:
+    """Mean over pixels, weighted if there are weights."""
+    if weights is None:
+        return values.mean((-2, -1))
+    return (values * weights).sum((-2, -1)) / weights.sum((-2, -1)).clamp(min=1e-6)
 
 
 def distillation_terms(
-    student: ViewGeometry, target: ViewGeometry, config: AdaptConfig, *, depth_weight: float, normal_weight: float
+    student: ViewGeometry,
+    target: ViewGeometry,
+    config: AdaptConfig,
+    *,
+    depth_weight: float,
+    normal_weight: float,
+    pixel_weights: Float[Tensor, "view height width"] | None = None,
 ) -> LossTerms:
     """Eq. (anchor) with alpha, Eq. (gen) with beta: the same three distances, summed over the views given."""
+    depth = depth_distance(student.depth, target.depth, config.depth_distance, pixel_weights)
     return LossTerms(
         camera=camera_distance(student.camera_vector, target.camera_vector, config.camera_huber).sum(),
-        depth=depth_weight * depth_distance(student.depth, target.depth, config.depth_distance).sum(),
-        normal=normal_weight * normal_distance(student.normals, target.normals).sum(),
+        depth=depth_weight * depth.sum(),
+        normal=normal_weight * normal_distance(student.normals, target.normals, pixel_weights).sum(),
     )
 
 
@@ -110,8 +129,18 @@ def anchor_loss(student: ViewGeometry, anchors: ViewGeometry, config: AdaptConfi
     )
 
 
-def generation_loss(student: ViewGeometry, teacher: ViewGeometry, config: AdaptConfig) -> LossTerms:
-    """Eq. (gen) on the inserted view; the EMA teacher's outputs are constants."""
+def generation_loss(
+    student: ViewGeometry,
+    teacher: ViewGeometry,
+    config: AdaptConfig,
+    pixel_weights: Float[Tensor, "1 height width"] | None = None,
+) -> LossTerms:
+    """Eq. (gen) on the inserted view; the EMA teacher's outputs are constants. ``pixel_weights`` are ours, see `consistency`."""
     return distillation_terms(
-        student, teacher.detach(), config, depth_weight=config.beta_depth, normal_weight=config.beta_normal
+        student,
+        teacher.detach(),
+        config,
+        depth_weight=config.beta_depth,
+        normal_weight=config.beta_normal,
+        pixel_weights=pixel_weights,
     )

@@ -49,7 +49,11 @@ class StepLosses:
 
 
 def step_losses(
-    student: ViewGeometry, anchors: ViewGeometry, teacher: ViewGeometry | None, config: AdaptConfig
+    student: ViewGeometry,
+    anchors: ViewGeometry,
+    teacher: ViewGeometry | None,
+    config: AdaptConfig,
+    inserted_weights: Float[Tensor, "1 height width"] | None = None,
 ) -> StepLosses:
     """Eq. (anchor) on the captured views, Eq. (gen) on the inserted one.
 
@@ -58,6 +62,7 @@ def step_losses(
         anchors: targets of the captured views, see `anchor_targets`.
         teacher: prediction of the inserted view, the last of the batch; None if the batch has none.
         config: weights and distances.
+        inserted_weights: how much each pixel of the inserted view counts, see `consistency`; None: all alike.
     """
     count = anchors.depth.shape[0]
     anchor = anchor_loss(student.view(0, count), anchors, config)
@@ -65,7 +70,7 @@ def step_losses(
         zero = anchor.total.new_zeros(())
         gen = LossTerms(camera=zero, depth=zero, normal=zero)
     else:
-        gen = generation_loss(student.view(count), teacher, config)
+        gen = generation_loss(student.view(count), teacher, config, inserted_weights)
     return StepLosses(
         anchor_camera=anchor.camera,
         anchor_depth=anchor.depth,

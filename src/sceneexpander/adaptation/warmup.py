@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sceneexpander.adaptation.photometric import photometric_error, renderable
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.models.protocol import ALL_HEADS, Prediction, Reconstructor, as_module
-from sceneexpander.splatting import render
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,33 +61,16 @@ def held_out_cells(
     return grown[:, :height, :width]
 
 
-def photometric_error(
+def _error(
     prediction: Prediction,
     images: Float[Tensor, "view 3 height width"],
     view: int,
     mask: Bool[Tensor, "height width"],
     config: WarmupConfig,
 ) -> Float[Tensor, ""]:
-    """Mean absolute error of the photo of ``view`` rendered from all Gaussians, plus that from the other views' Gaussians."""
-    gaussians = prediction.gaussians
-    if gaussians is None:
-        raise ValueError("the warm-up needs the Gaussian head")
-    height, width = images.shape[-2:]
-    pose, intrinsics = prediction.world_from_cam[view : view + 1], prediction.intrinsics_px[view : view + 1]
-    whole = render(gaussians, pose, intrinsics, height, width)
-    error = (whole.rgb[0] - images[view]).abs().mean(0)
-    total = _masked_mean(error, mask)
-    if config.others_weight > 0 and images.shape[0] > 1:
-        others = render(gaussians.select(gaussians.source_view != view), pose, intrinsics, height, width)
-        covered = (others.alpha[0].detach() > config.min_alpha) & mask
-        # Colour of what is there, not of the black behind it: the loss is to move geometry, not to fill holes.
-        colour = others.rgb[0] / others.alpha[0].clamp(min=config.min_alpha)
-        total = total + config.others_weight * _masked_mean((colour - images[view]).abs().mean(0), covered)
-    return total
-
-
-def _masked_mean(values: Float[Tensor, "height width"], mask: Bool[Tensor, "height width"]) -> Float[Tensor, ""]:
-    return (values * mask).sum() / mask.sum().clamp(min=1)
+    return photometric_error(
+        prediction, images, view, mask, others_weight=config.others_weight, min_alpha=config.min_alpha
+    )
 
 
 def warm_up(
@@ -117,9 +100,9 @@ def warm_up(
     for step in range(config.steps):
         view = order[step % views]
         prediction = model.predict(images, priors, heads=ALL_HEADS)
-        if not _renderable(prediction):
+        if not renderable(prediction):
             break  # the steps were too large for this scene: the check below rejects the result
-        loss = photometric_error(prediction, images, view, ~hidden[view], config)
+        loss = _error(prediction, images, view, ~hidden[view], config)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
@@ -134,15 +117,6 @@ def warm_up(
     return WarmupReport(steps=config.steps, before=before, after=after, accepted=accepted)
 
 
-def _renderable(prediction: Prediction) -> bool:
-    """Whether cameras and Gaussians are finite and the focal lengths positive."""
-    values = [prediction.world_from_cam, prediction.intrinsics_px]
-    if prediction.gaussians is not None:
-        values += [prediction.gaussians.means, prediction.gaussians.scales, prediction.gaussians.opacities]
-    finite = all(bool(torch.isfinite(value).all()) for value in values)
-    return finite and bool((prediction.intrinsics_px[:, [0, 1], [0, 1]] > 0).all())
-
-
 @torch.no_grad()
 def _held_out_error(
     model: Reconstructor,
@@ -152,7 +126,7 @@ def _held_out_error(
     config: WarmupConfig,
 ) -> float:
     prediction = model.predict(images, priors, heads=ALL_HEADS)
-    if not _renderable(prediction):
+    if not renderable(prediction):
         return math.inf
-    errors = [photometric_error(prediction, images, v, hidden[v], config) for v in range(images.shape[0])]
+    errors = [_error(prediction, images, v, hidden[v], config) for v in range(images.shape[0])]
     return float(torch.stack(errors).mean())

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.adaptation.consistency import trusted
 from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, StepRecord, adapt
+from sceneexpander.adaptation.realign import realign
 from sceneexpander.adaptation.warmup import WarmupConfig, WarmupReport, warm_up
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView
@@ -151,6 +153,15 @@ def adapt_round(
 ) -> tuple[ExpansionState, Reconstruction, AdaptationResult]:
     """Algorithm 1, then the expanded scene with the adapted weights: the state that the next round starts from."""
     state = inputs.state
+    joint_priors, _ = realign(
+        state.priors,
+        inputs.joint_priors,
+        inputs.anchors,
+        state.views.images,
+        inputs.inserted.view.images[0],
+        config.realign,
+        generator=child_generator(seed, "realign"),
+    )
     loaded.apply(state.weights)
     result = adapt(
         loaded.model,
@@ -159,7 +170,7 @@ def adapt_round(
             inserted=inputs.inserted.view.images[0].to(loaded.device),
             anchors=_device_anchors(inputs.anchors, loaded),
             captured_priors=_device_priors(state.priors, loaded),
-            joint_priors=_device_priors(inputs.joint_priors, loaded),
+            joint_priors=_device_priors(joint_priors, loaded),
         ),
         config,
         seed=seed,
@@ -169,8 +180,9 @@ def adapt_round(
     # Without a step nothing changed: keep the very change that the round started from, bit for bit.
     weights = WeightsChange.between(loaded.base, result.student) if config.steps else state.weights
     views = state.views.append(inputs.inserted.view)
-    expanded = ExpansionState(views=views, priors=inputs.joint_priors, weights=weights)
-    return expanded, reconstruct(views, inputs.joint_priors, loaded, weights, method="sceneexpander"), result
+    expanded = ExpansionState(views=views, priors=joint_priors, weights=weights)
+    reconstruction = reconstruct(views, joint_priors, loaded, weights, method="sceneexpander")
+    return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction, result
 
 
 def _device_priors(priors: Priors, loaded: LoadedModel) -> Priors | None:

@@ -100,6 +100,17 @@ def test_the_rows_of_the_papers_table_add_one_component_each() -> None:
     assert rows["full"].restore_interval > 0
 
 
+def test_the_controls_take_away_what_they_say() -> None:
+    full = typed(composed()).adapt
+    without = typed(composed("ablation=control_no_insertion")).adapt
+    assert (without.insertion_probability, without.lambda_gen) == (0, 0)
+    assert without.steps == full.steps > 0
+    assert typed(composed("ablation=control_no_anchor")).adapt.lambda_anchor == 0 < full.lambda_anchor
+    only = typed(composed("ablation=control_trust_only")).adapt
+    assert only.trust
+    assert only.steps == 0
+
+
 def test_the_gpu_profile_with_worldmirror_has_the_papers_values() -> None:
     config = typed(composed("profile=gpu", "model=worldmirror", "model.weights=x.safetensors"))
     paper = AdaptConfig()  # its defaults are the paper's, and are tested as such where they live

@@ -1,0 +1,138 @@
+"""Whether a candidate view can be inserted at all, told before anything is adapted (beyond the paper).
+
+The paper chooses candidates by eye, and shows one severe inconsistency that its adaptation could not mend. What can be measured
+without truth: whether the front-end found a camera for the candidate, how much of it overlaps with the captured views, whether its
+depth and its colours agree with them there, and how far it moved the captured cameras when everything was estimated together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.adaptation.config import Realign
+from sceneexpander.adaptation.consistency import agreement
+from sceneexpander.adaptation.realign import realign
+from sceneexpander.artifacts.anchors import Anchors
+from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.priors import Priors
+from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg, transform_points
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AcceptanceLimits:
+    """Beyond which a candidate is refused. Chosen on expandbench; see the table in the documentation for how well they tell."""
+
+    min_overlap: float = 0.05
+    max_depth_conflict: float = 0.12
+    max_colour_conflict: float = 0.16
+    max_cameras_moved_deg: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acceptance:
+    """What was measured, and why the candidate is refused (empty: it is accepted).
+
+    ``overlap``: share of its pixels that a captured view sees, too. Over those: ``depth_conflict``, the median absolute log ratio of
+    its depth and the captured one; ``colour_conflict``, the median absolute colour difference, each channel's mean difference taken
+    out. ``cameras_moved_deg``: largest turn of a captured camera by its presence. None where there is nothing to measure.
+    """
+
+    posed: bool
+    overlap: float
+    depth_conflict: float | None
+    colour_conflict: float | None
+    cameras_moved_deg: float
+    reasons: tuple[str, ...]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether nothing speaks against it."""
+        return not self.reasons
+
+
+@torch.no_grad()
+def judge_candidate(
+    captured: Priors,
+    joint: Priors,
+    anchors: Anchors,
+    images: Float[Tensor, "captured 3 height width"],
+    inserted: Float[Tensor, "3 height width"],
+    limits: AcceptanceLimits,
+) -> Acceptance:
+    """Judge the view that ``joint`` has beyond ``captured``. Both need poses, intrinsics and depth; ``inserted`` is its picture."""
+    held, _ = realign(captured, joint, anchors, images, inserted, Realign.HOLD, generator=torch.Generator())
+    poses, intrinsics, depth = held.world_from_cam, held.intrinsics_px, held.depth
+    before, after = captured.world_from_cam, joint.world_from_cam
+    if poses is None or intrinsics is None or depth is None or before is None or after is None:
+        raise ValueError("a candidate can only be judged where the front-end has run")
+    count = len(images)
+    posed = held.posed is None or bool(held.posed[-1])
+    moved = rotation_angle_deg(after[1:count, :3, :3], before[1:, :3, :3]) if count > 1 else torch.zeros(1)
+    points = unproject_to_world(depth[-1:], intrinsics[-1:], poses[-1:])[0]
+    found = agreement(points, anchors.depth, poses[:count], intrinsics[:count])
+    overlap = float(found.seen.float().mean())
+    depth_conflict = float(found.conflict[found.seen].abs().median()) if posed and bool(found.seen.any()) else None
+    colour_conflict = _colour_conflict(depth[-1], poses, intrinsics, images, inserted, found.seen) if posed else None
+    measured = Acceptance(
+        posed=posed,
+        overlap=overlap,
+        depth_conflict=depth_conflict,
+        colour_conflict=colour_conflict,
+        cameras_moved_deg=float(moved.max()),
+        reasons=(),
+    )
+    return Acceptance(
+        posed=posed,
+        overlap=overlap,
+        depth_conflict=depth_conflict,
+        colour_conflict=colour_conflict,
+        cameras_moved_deg=measured.cameras_moved_deg,
+        reasons=tuple(_reasons(measured, limits)),
+    )
+
+
+def _colour_conflict(
+    depth: Tensor, poses: Tensor, intrinsics: Tensor, images: Tensor, inserted: Tensor, seen: Tensor
+) -> float | None:
+    """Median over the seen pixels of the colour difference to the captured view that fits best there."""
+    if not bool(seen.any()):
+        return None
+    height, width = depth.shape
+    points = unproject_to_world(depth[None], intrinsics[-1:], poses[-1:]).reshape(-1, 3)[seen.flatten()]
+    own = inserted.flatten(1)[:, seen.flatten()]
+    best = torch.full((own.shape[1],), torch.inf, device=own.device)
+    for view in range(len(images)):
+        local = transform_points(rigid_inverse(poses[view]), points)
+        z = local[:, 2]
+        pixel = (local @ intrinsics[view].T)[:, :2] / z.clamp(min=1e-6)[:, None]
+        grid = pixel / pixel.new_tensor([width / 2, height / 2]) - 1
+        inside = (z > 1e-6) & (grid.abs() < 1).all(-1)
+        if not bool(inside.any()):
+            continue
+        there = torch.nn.functional.grid_sample(
+            images[view][None], grid.clamp(-2, 2)[None, :, None], align_corners=False, padding_mode="border"
+        )[0, :, :, 0]
+        difference = there - own
+        difference = difference - difference[:, inside].mean(1, keepdim=True)
+        best = torch.where(inside, torch.minimum(best, difference.abs().mean(0)), best)
+    known = best[best.isfinite()]
+    return float(known.median()) if len(known) else None
+
+
+def _reasons(measured: Acceptance, limits: AcceptanceLimits) -> list[str]:
+    found = []
+    if not measured.posed:
+        found.append("no camera could be found for it")
+    if measured.overlap < limits.min_overlap:
+        found.append(f"only {measured.overlap:.0%} of it overlap with the captured views")
+    if measured.depth_conflict is not None and measured.depth_conflict > limits.max_depth_conflict:
+        found.append(f"its depth contradicts the captured views (by {measured.depth_conflict:.0%})")
+    if measured.colour_conflict is not None and measured.colour_conflict > limits.max_colour_conflict:
+        found.append(f"its colours contradict the captured views (by {measured.colour_conflict:.2f})")
+    if measured.cameras_moved_deg > limits.max_cameras_moved_deg:
+        found.append(f"it turns a captured camera by {measured.cameras_moved_deg:.1f} degrees")
+    return found

@@ -1,0 +1,173 @@
+"""How far the inserted view agrees with what the captured views saw, point by point (beyond the paper).
+
+A point is looked up in every captured view. Where one of them sees that very place, the inserted view is only as good as its
+agreement with the captured depth; where none does, nothing contradicts it and its own confidence decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.gaussians import SH_DC
+from sceneexpander.geometry.rigid import rigid_inverse, transform_points
+from sceneexpander.models.protocol import Prediction
+from sceneexpander.splatting import render
+
+SAME_SURFACE = 0.04  # log-depth difference that still counts as the same surface
+SAME_COLOUR = 0.1  # mean absolute RGB difference, the same way
+_HIDDEN = 3 * SAME_SURFACE  # a point further behind what a view sees is hidden from it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agreement:
+    """Of points with captured depth maps.
+
+    ``weight`` is 1 where nothing contradicts the point and falls to 0 with the log-depth difference to the best agreeing view;
+    ``seen``: some captured view has the point in frame and not hidden; ``conflict``: the signed log ratio (point / captured depth) in the
+    view that agrees best, negative in front; 0 where not seen.
+    """
+
+    weight: Float[Tensor, "*point"]
+    seen: Bool[Tensor, "*point"]
+    conflict: Float[Tensor, "*point"]
+
+
+@torch.no_grad()
+def agreement(
+    points_world: Float[Tensor, "*point 3"],
+    captured_depth: Float[Tensor, "view height width"],
+    captured_world_from_cam: Float[Tensor, "view 4 4"],
+    captured_intrinsics_px: Float[Tensor, "view 3 3"],
+) -> Agreement:
+    """Compare points with the captured views' depth maps, all in one frame and scale."""
+    points = points_world.reshape(-1, 3)
+    there, z, in_frame = _seen_at(
+        points, captured_depth[:, None], captured_world_from_cam, captured_intrinsics_px, "nearest"
+    )
+    ratio = torch.where(in_frame, (z / there[:, 0].clamp(min=1e-6)).log(), torch.inf)
+    # Behind what a view sees, the point is hidden from it: no evidence either way.
+    visible = in_frame & (ratio < _HIDDEN)
+    distance = torch.where(visible, ratio.abs(), torch.inf)
+    nearest, view = distance.min(0)
+    seen = nearest.isfinite()
+    conflict = torch.where(seen, ratio.gather(0, view[None])[0], 0.0)
+    weight = torch.where(seen, torch.exp(-((conflict / SAME_SURFACE) ** 2) / 2), 1.0)
+    shape = points_world.shape[:-1]
+    return Agreement(weight=weight.view(shape), seen=seen.view(shape), conflict=conflict.view(shape))
+
+
+def confidence_weight(confidence: Float[Tensor, "*batch height width"]) -> Float[Tensor, "*batch height width"]:
+    """A confidence (> 1, larger is surer) as a weight in [0, 1): 1 - 1 / confidence."""
+    return 1 - 1 / confidence.clamp(min=1)
+
+
+@torch.no_grad()
+def inserted_weights(
+    prediction: Prediction, anchored_depth: Float[Tensor, "captured height width"]
+) -> Float[Tensor, "1 height width"]:
+    """Weights of the inserted view's pixels with mean 1: agreement with the captured views x the model's own confidence.
+
+    Args:
+        prediction: of some captured views, then the inserted one.
+        anchored_depth: of those captured views.
+    """
+    count = len(anchored_depth)
+    if prediction.depth is None:
+        raise ValueError("the weights need the depth head")
+    poses, intrinsics = prediction.world_from_cam, prediction.intrinsics_px
+    points = unproject_to_world(prediction.depth[count:], intrinsics[count:], poses[count:])[0]
+    weight = agreement(points, anchored_depth, poses[:count], intrinsics[:count]).weight
+    if prediction.depth_conf is not None:
+        weight = weight * confidence_weight(prediction.depth_conf[count])
+    return (weight / weight.mean().clamp(min=1e-6))[None]
+
+
+def trusted(reconstruction: Reconstruction, images: Float[Tensor, "view 3 height width"]) -> Reconstruction:
+    """The same reconstruction with generated Gaussians as opaque as the captured views let them be.
+
+    The opacity of every Gaussian of a generated view is multiplied by how well its place and its colour agree with the captured views
+    that see it: what stands in space that a photo looks through fades, and so does what is painted onto a surface that a photo shows
+    in another colour. What no captured view sees stays as it is. It also fades a requested object that stands where the photos show
+    it is not.
+
+    Args:
+        reconstruction: of captured and generated views.
+        images: the pictures of its views, in its order.
+    """
+    gaussians = reconstruction.gaussians
+    captured = ~reconstruction.generated
+    made = gaussians.generated
+    if not bool(made.any()) or not bool(captured.any()):
+        return reconstruction
+    points = gaussians.means[made]
+    cameras = reconstruction.world_from_cam[captured], reconstruction.intrinsics_px[captured]
+    found = agreement(points, reconstruction.depth[captured], *cameras)
+    colours = gaussians.sh[made, 0] * SH_DC + 0.5
+    off = colour_difference(points, colours, images[captured], reconstruction.depth[captured], *cameras)
+    agrees = found.weight * torch.where(found.seen, torch.exp(-((off / SAME_COLOUR) ** 2) / 2), 1.0)
+    filled = _filled_by_captured(reconstruction)
+    opacities = gaussians.opacities.clone()
+    opacities[made] *= 1 - filled * (1 - agrees)
+    return replace(reconstruction, gaussians=replace(gaussians, opacities=opacities))
+
+
+@torch.no_grad()
+def _filled_by_captured(reconstruction: Reconstruction) -> Float[Tensor, "made"]:
+    """For every generated Gaussian: how far captured Gaussians alone fill its pixel, seen from the view that made it."""
+    gaussians = reconstruction.gaussians
+    height, width = reconstruction.depth.shape[1:]
+    taken = gaussians.select(~gaussians.generated)
+    sources = gaussians.source_view[gaussians.generated]
+    points = gaussians.means[gaussians.generated]
+    filled = torch.zeros_like(points[:, 0])
+    for view in torch.nonzero(reconstruction.generated)[:, 0].tolist():
+        camera = reconstruction.world_from_cam[view][None], reconstruction.intrinsics_px[view][None]
+        alpha = render(taken, *camera, height, width).alpha
+        own = sources == view
+        there, _, in_frame = _seen_at(points[own], alpha[:, None], *camera, "bilinear")
+        filled[own] = torch.where(in_frame[0], there[0, 0], 0.0).clamp(0, 1)
+    return filled
+
+
+@torch.no_grad()
+def colour_difference(
+    points_world: Float[Tensor, "point 3"],
+    colours: Float[Tensor, "point 3"],
+    captured_images: Float[Tensor, "view 3 height width"],
+    captured_depth: Float[Tensor, "view height width"],
+    captured_world_from_cam: Float[Tensor, "view 4 4"],
+    captured_intrinsics_px: Float[Tensor, "view 3 3"],
+) -> Float[Tensor, "point"]:
+    """Mean absolute RGB difference of points to the captured view that fits best of those that see them; 0 where none does."""
+    content = torch.cat([captured_images, captured_depth[:, None]], dim=1)
+    there, z, in_frame = _seen_at(points_world, content, captured_world_from_cam, captured_intrinsics_px, "bilinear")
+    visible = in_frame & ((z / there[:, 3].clamp(min=1e-6)).log() < _HIDDEN)
+    off = (there[:, :3] - colours.T).abs().mean(1)
+    best = torch.where(visible, off, torch.inf).amin(0)
+    return torch.where(best.isfinite(), best, 0.0)
+
+
+def _seen_at(
+    points_world: Float[Tensor, "point 3"],
+    content: Float[Tensor, "view channel height width"],
+    world_from_cam: Float[Tensor, "view 4 4"],
+    intrinsics_px: Float[Tensor, "view 3 3"],
+    mode: str,
+) -> tuple[Float[Tensor, "view channel point"], Float[Tensor, "view point"], Bool[Tensor, "view point"]]:
+    """(views' content where the points project, the points' depth there, whether they are in frame)."""
+    views, _, height, width = content.shape
+    local = transform_points(rigid_inverse(world_from_cam), points_world.expand(views, -1, -1))
+    z = local[..., 2].clamp(min=1e-6)
+    pixel = (local @ intrinsics_px.transpose(-1, -2))[..., :2] / z[..., None]
+    grid = pixel / pixel.new_tensor([width / 2, height / 2]) - 1
+    in_frame = (local[..., 2] > 1e-6) & (grid.abs() < 1).all(-1)
+    sampled = torch.nn.functional.grid_sample(
+        content, grid.clamp(-2, 2)[:, :, None], mode=mode, padding_mode="border", align_corners=False
+    )
+    return sampled[..., 0], z, in_frame

@@ -1,0 +1,223 @@
+"""Runs cells of the benchmark: scene x grade x row x seed. Every finished cell is kept, so an interrupted run continues."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import torch
+
+from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.adaptation.warmup import WarmupConfig
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.store import read_json, to_plain, write_json_atomic
+from sceneexpander.expandbench.grades import grade_named
+from sceneexpander.expandbench.measure import BenchNumbers, measure
+from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
+from sceneexpander.expandbench.scenes import BenchScene, build_scene
+from sceneexpander.expansion import LoadedModel, ModelConfig, adapt_round, load_model
+from sceneexpander.expansion.rounds import reconstruct
+from sceneexpander.frontend.prior import FrontendConfig
+
+CAPTURED = "captured"  # the pre-insertion scene: the ceiling of preservation
+BASELINE = "baseline"  # the same weights given the inserted view
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What all cells share. ``code`` identifies the programs: results of other code are made again unless ``any_code``."""
+
+    model: ModelConfig
+    frontend: FrontendConfig
+    warmup: WarmupConfig
+    cache: Path
+    code: str = ""
+    any_code: bool = False
+    threads: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """Which cells. ``rows`` are configurations by name; `CAPTURED` and `BASELINE` are always measured."""
+
+    scenes: tuple[str, ...]
+    grades: tuple[str, ...]
+    rows: Mapping[str, AdaptConfig]
+    seeds: tuple[int, ...]
+
+    def __len__(self) -> int:
+        adapted = len(self.rows) * len(self.seeds)
+        return len(self.scenes) * (1 + len(self.grades) * (1 + adapted))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CellResult:
+    """One reconstruction's numbers. ``alone``: the same weights given the captured views only (None for the two fixed rows).
+
+    ``grade`` is empty for `CAPTURED`, which no grade changes.
+    """
+
+    scene: str
+    grade: str
+    row: str
+    seed: int
+    steps: int
+    seconds: float
+    code: str
+    numbers: BenchNumbers
+    alone: BenchNumbers | None = None
+
+    @classmethod
+    def from_plain(cls, item: dict[str, object]) -> CellResult:
+        """From the JSON form."""
+        values = dict(item)
+        for name in ("numbers", "alone"):
+            content = values[name]
+            if isinstance(content, dict):
+                values[name] = BenchNumbers(**content)
+        return cls(**values)  # type: ignore[arg-type]
+
+
+def run(
+    plan: Plan, settings: Settings, *, processes: int = 1, on_cell: Callable[[CellResult], None] | None = None
+) -> list[CellResult]:
+    """Measure every cell of the plan, from the cache where it has been measured before. Results are in the plan's order.
+
+    Args:
+        processes: how many scenes are worked on at the same time.
+        on_cell: called as each cell becomes known.
+    """
+    results: list[CellResult] = []
+    if processes <= 1:
+        for name in plan.scenes:
+            results.extend(_collect(_scene_cells(name, plan, settings), on_cell))
+        return results
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        for cells in pool.map(_scene_results, *zip(*[(name, plan, settings) for name in plan.scenes], strict=True)):
+            results.extend(_collect(iter(cells), on_cell))
+    return results
+
+
+def _collect(cells: Iterator[CellResult], on_cell: Callable[[CellResult], None] | None) -> Iterator[CellResult]:
+    for cell in cells:
+        if on_cell is not None:
+            on_cell(cell)
+        yield cell
+
+
+def _scene_results(name: str, plan: Plan, settings: Settings) -> list[CellResult]:
+    return list(_scene_cells(name, plan, settings))
+
+
+class _Worker:
+    """One scene's cells; models and prepared inputs are made only when a cell is not in the cache."""
+
+    def __init__(self, name: str, settings: Settings) -> None:
+        self.name, self.settings = name, settings
+        shared = {"model": settings.model, "frontend": settings.frontend, "warmup": settings.warmup}
+        self.shared = json.dumps(to_plain(shared), sort_keys=True)
+        key = hashlib.sha256(f"{self.shared}:{settings.code if not settings.any_code else ''}".encode()).hexdigest()
+        self.folder = settings.cache / "prepared" / key[:16] / name
+        self._scene: BenchScene | None = None
+        self._loaded: LoadedModel | None = None
+        self._prepared: PreparedScene | None = None
+        self._cases: dict[str, PreparedCase] = {}
+
+    def cell(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult:
+        """The cell's result, kept or new."""
+        identity = {"shared": self.shared, "scene": self.name, "grade": grade, "row": to_plain(config), "seed": seed}
+        if config is None:
+            identity["row"] = row
+        key = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+        path = self.settings.cache / "results" / f"{key[:32]}.json"
+        if path.exists():
+            known = CellResult.from_plain(read_json(path) | {"row": row})
+            if self.settings.any_code or known.code == self.settings.code:
+                return known
+        result = self._measured(grade, row, seed, config)
+        write_json_atomic(path, result)
+        return result
+
+    def _measured(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult:
+        torch.set_num_threads(self.settings.threads)
+        alone: BenchNumbers | None = None
+        seconds, steps = 0.0, 0
+        if row == CAPTURED:
+            reconstruction = self.prepared.captured
+            case = None
+        else:
+            case = self.case(grade)
+            reconstruction = case.backbone
+        if config is not None and case is not None:
+            started = time.perf_counter()
+            state, reconstruction, adapted = adapt_round(case.inputs, self.loaded, config, seed=seed)
+            seconds, steps = time.perf_counter() - started, len(adapted.records)
+            before = case.inputs.state
+            without = reconstruct(before.views, before.priors, self.loaded, state.weights, method="alone")
+            alone = self._numbers(without, None)
+        return CellResult(
+            scene=self.name,
+            grade=grade,
+            row=row,
+            seed=seed,
+            steps=steps,
+            seconds=seconds,
+            code=self.settings.code,
+            numbers=self._numbers(reconstruction, case),
+            alone=alone,
+        )
+
+    def _numbers(self, reconstruction: Reconstruction, case: PreparedCase | None) -> BenchNumbers:
+        views, truth = self.scene.captured, self.scene.truth
+        if case is not None:
+            views, truth = views.append(case.inputs.inserted.view), case.truth
+        return measure(reconstruction, views, truth, self.scene)
+
+    @property
+    def scene(self) -> BenchScene:
+        """The scene, rendered at the first call."""
+        if self._scene is None:
+            self._scene = build_scene(self.name)
+        return self._scene
+
+    @property
+    def loaded(self) -> LoadedModel:
+        """The model, loaded at the first call."""
+        if self._loaded is None:
+            self._loaded = load_model(self.settings.model)
+        return self._loaded
+
+    @property
+    def prepared(self) -> PreparedScene:
+        """The pre-insertion scene."""
+        if self._prepared is None:
+            s = self.settings
+            self._prepared = prepare_scene(self.scene, self.loaded, s.frontend, s.warmup, self.folder)
+        return self._prepared
+
+    def case(self, grade: str) -> PreparedCase:
+        """The scene with a view of that grade inserted."""
+        if grade not in self._cases:
+            chosen = grade_named(grade)
+            self._cases[grade] = prepare_case(
+                self.scene, self.prepared, chosen, self.loaded, self.settings.frontend, self.folder
+            )
+        return self._cases[grade]
+
+
+def _scene_cells(name: str, plan: Plan, settings: Settings) -> Iterator[CellResult]:
+    worker = _Worker(name, settings)
+    yield worker.cell("", CAPTURED, 0, None)
+    for grade in plan.grades:
+        yield worker.cell(grade, BASELINE, 0, None)
+        for row, config in plan.rows.items():
+            for seed in plan.seeds:
+                yield worker.cell(grade, row, seed, config)

@@ -1,0 +1,181 @@
+"""From cells to tables: the paper's shape with spread over seeds, paired differences, and gain against misalignment."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from sceneexpander.expandbench.measure import BenchNumbers
+from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
+
+Number = Callable[[BenchNumbers], float | None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """A number of `BenchNumbers` as a column. ``expansion``: without meaning for the captured views alone."""
+
+    name: str
+    title: str
+    digits: int = 2
+    higher: bool = True
+    expansion: bool = False
+
+    def of(self, numbers: BenchNumbers) -> float | None:
+        """The value."""
+        value = getattr(numbers, self.name)
+        return None if value is None else float(value)
+
+
+COLUMNS: tuple[Column, ...] = (
+    Column(name="psnr_db", title="PSNR ↑"),
+    Column(name="ssim", title="SSIM ↑", digits=3),
+    Column(name="others_psnr_db", title="cross-view PSNR ↑"),
+    Column(name="camera_rotation_deg", title="camera ° ↓", higher=False),
+    Column(name="depth_abs_rel", title="depth AbsRel ↓", digits=4, higher=False),
+    Column(name="inserted_psnr_db", title="insertion PSNR ↑", expansion=True),
+    Column(name="new_psnr_db", title="new-region PSNR ↑"),
+    Column(name="new_coverage", title="new-region drawn ↑", digits=3),
+    Column(name="new_depth_abs_rel", title="new-region AbsRel ↓", digits=3, higher=False),
+    Column(name="between_psnr_db", title="half-way PSNR ↑"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Paired:
+    """Differences of a row to the baseline in the same scene and grade, one per scene (mean over grades and seeds)."""
+
+    row: str
+    mean: float
+    lowest: float
+    seed_spread: float | None  # standard deviation over seeds of the mean over scenes and grades
+    better: int
+    scenes: int
+
+
+def row_names(cells: Sequence[CellResult]) -> list[str]:
+    """Rows in order of appearance, the two fixed ones first."""
+    found = dict.fromkeys(cell.row for cell in cells)
+    return [name for name in (CAPTURED, BASELINE) if name in found] + [
+        name for name in found if name not in (CAPTURED, BASELINE)
+    ]
+
+
+def mean_of(cells: Iterable[CellResult], column: Column, *, alone: bool = False) -> float | None:
+    """Mean over the cells; None as soon as one of them has no value, or there is none."""
+    holders = [cell.alone if alone else cell.numbers for cell in cells]
+    values = [None if holder is None else column.of(holder) for holder in holders]
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None
+
+
+def seed_spread(cells: Sequence[CellResult], column: Column) -> float | None:
+    """Standard deviation over seeds of the mean over scenes and grades; None for fewer than two seeds."""
+    means = [
+        mean_of([cell for cell in cells if cell.seed == seed], column) for seed in sorted({cell.seed for cell in cells})
+    ]
+    known = [value for value in means if value is not None]
+    return statistics.stdev(known) if len(known) > 1 and len(known) == len(means) else None
+
+
+def paired(cells: Sequence[CellResult], row: str, column: Column) -> Paired | None:
+    """A row against the baseline; None if they share no scene and grade with a value."""
+    base = {(c.scene, c.grade): column.of(c.numbers) for c in cells if c.row == BASELINE}
+    own = [c for c in cells if c.row == row]
+    differences: dict[str, list[float]] = {}
+    by_seed: dict[int, list[float]] = {}
+    for cell in own:
+        value, reference = column.of(cell.numbers), base.get((cell.scene, cell.grade))
+        if value is None or reference is None:
+            continue
+        differences.setdefault(cell.scene, []).append(value - reference)
+        by_seed.setdefault(cell.seed, []).append(value - reference)
+    if not differences:
+        return None
+    means = [sum(values) / len(values) for values in differences.values()]
+    seeds = [sum(values) / len(values) for values in by_seed.values()]
+    return Paired(
+        row=row,
+        mean=sum(means) / len(means),
+        lowest=min(means) if column.higher else max(means),
+        seed_spread=statistics.stdev(seeds) if len(seeds) > 1 else None,
+        better=sum((value > 0) == column.higher and value != 0 for value in means),
+        scenes=len(means),
+    )
+
+
+def main_table(cells: Sequence[CellResult], columns: Sequence[Column] = COLUMNS) -> str:
+    """One line per row: means over scenes and grades, ± over seeds."""
+    lines = []
+    for row in row_names(cells):
+        own = [cell for cell in cells if cell.row == row]
+        texts = []
+        for column in columns:
+            value = None if column.expansion and row == CAPTURED else mean_of(own, column)
+            spread = seed_spread(own, column)
+            text = "–" if value is None else f"{value:.{column.digits}f}"
+            texts.append(text if spread is None or value is None else f"{text} ± {spread:.{column.digits}f}")
+        lines.append([row, str(len(own)), *texts])
+    return _markdown(["row", "cells", *(column.title for column in columns)], lines)
+
+
+def paired_table(cells: Sequence[CellResult], columns: Sequence[Column] = COLUMNS) -> str:
+    """One line per row: mean difference to the baseline, the worst scene's, and how many scenes are better."""
+    lines = []
+    for row in row_names(cells):
+        if row in (CAPTURED, BASELINE):
+            continue
+        texts = []
+        for column in columns:
+            found = paired(cells, row, column)
+            texts.append(
+                "–"
+                if found is None
+                else f"{found.mean:+.{column.digits}f} (worst {found.lowest:+.{column.digits}f}; {found.better}/{found.scenes})"
+            )
+        lines.append([row, *texts])
+    return _markdown(["row", *(column.title for column in columns)], lines)
+
+
+def alone_table(cells: Sequence[CellResult]) -> str:
+    """The adapted weights on the captured views alone: what a row gains without any insertion to repair."""
+    lines = []
+    for row in row_names(cells):
+        own = [cell for cell in cells if cell.row == row and cell.alone is not None]
+        if own:
+            values = [mean_of(own, column, alone=True) for column in COLUMNS[:5]]
+            lines.append(
+                [
+                    row,
+                    *(
+                        "–" if value is None else f"{value:.{column.digits}f}"
+                        for value, column in zip(values, COLUMNS[:5], strict=True)
+                    ),
+                ]
+            )
+    return _markdown(["row", *(column.title for column in COLUMNS[:5])], lines)
+
+
+def curve_table(cells: Sequence[CellResult], rows: Sequence[str], column: Column = COLUMNS[0]) -> str:
+    """Per grade: the ceiling, the baseline's loss against it, and each row's gain over the baseline."""
+    lines = []
+    ceiling = mean_of([cell for cell in cells if cell.row == CAPTURED], column)
+    for grade in dict.fromkeys(cell.grade for cell in cells if cell.grade):
+        here = [cell for cell in cells if cell.grade == grade]
+        base = mean_of([cell for cell in here if cell.row == BASELINE], column)
+        texts = [
+            "–" if base is None or ceiling is None else f"{base - ceiling:+.{column.digits}f}",
+        ]
+        for row in rows:
+            found = paired(here, row, column)
+            texts.append(
+                "–" if found is None else f"{found.mean:+.{column.digits}f} (worst {found.lowest:+.{column.digits}f})"
+            )
+        lines.append([grade, *texts])
+    return _markdown(["grade", f"insertion's effect on {column.title}", *(f"{row} − baseline" for row in rows)], lines)
+
+
+def _markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    rule = [":--"] + ["--:"] * (len(header) - 1)
+    return "\n".join("| " + " | ".join(line) + " |" for line in [header, rule, *lines]) + "\n"

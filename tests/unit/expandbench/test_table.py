@@ -1,0 +1,106 @@
+"""Tables from made-up cells whose means, spreads and differences are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sceneexpander.expandbench.measure import BenchNumbers
+from sceneexpander.expandbench.plot import curve, plot
+from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
+from sceneexpander.expandbench.table import COLUMNS, curve_table, main_table, mean_of, paired, row_names, seed_spread
+
+PSNR = COLUMNS[0]
+DEPTH = next(column for column in COLUMNS if column.name == "depth_abs_rel")
+NUMBERS = BenchNumbers(
+    psnr_db=20.0, ssim=0.8, others_psnr_db=19.0, camera_rotation_deg=0.1, camera_direction_deg=0.2, depth_abs_rel=0.05,
+    inserted_psnr_db=25.0, inserted_rotation_deg=1.0, inserted_direction_deg=2.0, new_psnr_db=15.0, new_coverage=0.9,
+    new_depth_abs_rel=0.2, between_psnr_db=17.0,
+)  # fmt: skip
+
+
+def cell(
+    scene: str, row: str, psnr: float, *, seed: int = 0, grade: str = "mixed_1", depth: float = 0.05
+) -> CellResult:
+    return CellResult(
+        scene=scene, grade=grade, row=row, seed=seed, steps=0, seconds=0.0, code="c",
+        numbers=replace(NUMBERS, psnr_db=psnr, depth_abs_rel=depth),
+    )  # fmt: skip
+
+
+CELLS = [
+    cell("a", CAPTURED, 21.0, grade=""),
+    cell("b", CAPTURED, 23.0, grade=""),
+    cell("a", BASELINE, 20.0),
+    cell("b", BASELINE, 22.0),
+    cell("a", "full", 21.0, seed=0, depth=0.04),
+    cell("b", "full", 21.9, seed=0, depth=0.06),
+    cell("a", "full", 22.0, seed=1, depth=0.04),
+    cell("b", "full", 21.9, seed=1, depth=0.06),
+]
+
+
+def test_rows_start_with_the_fixed_ones() -> None:
+    assert row_names(CELLS[::-1]) == [CAPTURED, BASELINE, "full"]
+
+
+def test_means_and_spread_over_seeds() -> None:
+    own = [c for c in CELLS if c.row == "full"]
+    assert mean_of(own, PSNR) == pytest.approx((21 + 21.9 + 22 + 21.9) / 4)
+    # Per seed: 21.45 and 21.95.
+    assert seed_spread(own, PSNR) == pytest.approx(0.5 / 2**0.5)
+    assert seed_spread(own[:2], PSNR) is None
+
+
+def test_a_mean_with_a_gap_is_no_mean() -> None:
+    gap = replace(CELLS[4], numbers=replace(NUMBERS, others_psnr_db=None))
+    column = next(c for c in COLUMNS if c.name == "others_psnr_db")
+    assert mean_of([gap, CELLS[5]], column) is None
+    assert mean_of([], column) is None
+
+
+def test_differences_are_paired_by_scene_and_grade() -> None:
+    found = paired(CELLS, "full", PSNR)
+    assert found is not None
+    # Scene a: +1 and +2, scene b: -0.1 twice.
+    assert found.mean == pytest.approx((1.5 - 0.1) / 2)
+    assert found.lowest == pytest.approx(-0.1)
+    assert (found.better, found.scenes) == (1, 2)
+    assert found.seed_spread == pytest.approx(0.5 / 2**0.5)
+    assert paired(CELLS[:4], "full", PSNR) is None
+    assert paired([c for c in CELLS if c.row != BASELINE], "full", PSNR) is None
+
+
+def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
+    found = paired(CELLS, "full", DEPTH)
+    assert found is not None
+    assert found.mean == pytest.approx(0.0)
+    assert found.lowest == pytest.approx(0.01)
+    assert found.better == 1
+
+
+def test_the_tables_say_so() -> None:
+    text = main_table(CELLS)
+    assert "| full | 4 | 21.70 ± 0.35 |" in text
+    assert "| captured | 2 | 22.00 |" in text
+    curve = curve_table(CELLS, ["full"])
+    assert "| mixed_1 | -1.00 | +0.70 (worst -0.10) |" in curve
+
+
+def test_a_curve_is_relative_to_the_pre_insertion_scene(tmp_path: Path) -> None:
+    cells = [
+        *CELLS[:2],
+        cell("a", BASELINE, 21.0, grade="clean"),
+        cell("b", BASELINE, 22.5, grade="clean"),
+        cell("a", BASELINE, 19.0, grade="mixed_2"),
+        cell("b", BASELINE, 21.0, grade="mixed_2"),
+        *CELLS[2:4],
+    ]
+    assert curve(cells, BASELINE, "mixed", PSNR) == [(0.0, -0.25), (1, -1.0), (2, -2.0)]
+    assert plot(cells, tmp_path / "curve.svg")
+    first = (tmp_path / "curve.svg").read_bytes()
+    assert plot(cells, tmp_path / "curve.svg")
+    assert (tmp_path / "curve.svg").read_bytes() == first
+    assert not plot(CELLS[:2], tmp_path / "none.svg")
