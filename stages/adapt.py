@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.loop import StepRecord
@@ -16,7 +14,7 @@ from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, load_model
 from sceneexpander.progress import progress_bar
 from stages import layout
-from stages.runner import Cell, checkpoint_folder, remove_folder, stage, use_threads
+from stages.runner import Cell, checkpoint_folder, remove_folder, run_identity, stage, use_threads
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,16 +26,6 @@ class Sections:
     threads: int
     model: ModelConfig
     adapt: AdaptConfig
-
-
-def identity(sections: Sections, inputs: tuple[Path, ...]) -> str:
-    """Key of the resume points: configuration and input bytes. Another run never finds them."""
-    digest = hashlib.sha256(repr(sections).encode())
-    for folder in inputs:
-        for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-            digest.update(f"{path.as_posix()}\n".encode())
-            digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()[:32]
 
 
 @stage("scene", "round", "previous")
@@ -57,7 +45,7 @@ def main(cell: Cell) -> None:
         anchors=Anchors.load(sources[2]),
         joint_priors=load_priors(sources[3]),
     )
-    checkpoints = checkpoint_folder(identity(sections, sources))
+    checkpoints = checkpoint_folder(run_identity(sections, sources))
     loaded = load_model(sections.model, sections.device)
     with progress_bar(f"adapt {cell.scene} round {cell.round}", sections.adapt.steps) as bar:
 

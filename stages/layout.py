@@ -11,7 +11,9 @@ REPORT = OUTPUTS / "report"
 CODE = OUTPUTS / "code.json"
 OURS = ("captured", "backbone", "sceneexpander")  # always made: the pipeline itself needs them
 RIVALS = ("omnivggt", "ttt3r")  # networks of others
-METHODS = (*OURS, *RIVALS)
+SPLATTED = "gaussian_splatting"  # per-scene optimisation, started from the backbone
+OPTIMISABLE = ("sceneexpander", *RIVALS)  # what an optimisation after the fact can start from
+METHODS = (*OURS, SPLATTED, *RIVALS, *(f"{method}_optimised" for method in OPTIMISABLE))
 
 
 def source(scene: str) -> Path:
@@ -47,6 +49,11 @@ def state(scene: str, number: int) -> Path:
 def reconstruction(scene: str, number: int, method: str) -> Path:
     """The `Reconstruction` that a method made in a round, or why there is none (`Unavailable`)."""
     return round_folder(scene, number) / method / "reconstruction"
+
+
+def repeat_name(repeat: int) -> str:
+    """Folder, beside the reconstruction, of a method's further runs with other seeds; the first run is the reconstruction."""
+    return f"repeat_{repeat}" if repeat else "reconstruction"
 
 
 def inserted(scene: str, number: int) -> Path:

@@ -24,7 +24,7 @@ def read_overrides(path: Path) -> list[str]:
 
 
 def read_methods(path: Path) -> list[str]:
-    """The ``methods`` of params.yaml, all of them known."""
+    """The ``methods`` of params.yaml, all of them known, and none without what it starts from."""
     raw = read_yaml(path)
     methods = raw.get("methods") if isinstance(raw, dict) else None
     where = f"{path}: methods"
@@ -33,6 +33,9 @@ def read_methods(path: Path) -> list[str]:
     for method in methods:
         if method not in layout.METHODS:
             raise ConfigError(f"unknown {method!r}", where=where, fix=did_you_mean(str(method), layout.METHODS))
+    for start in layout.RIVALS:
+        if f"{start}_optimised" in methods and start not in methods:
+            raise ConfigError(f"'{start}_optimised' starts from {start!r}", where=where, fix=f"list {start} too")
     return [str(method) for method in methods]
 
 

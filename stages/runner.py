@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import hashlib
 import logging
 import os
 import platform
@@ -12,7 +13,7 @@ import resource
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,8 +42,18 @@ def project_root() -> Path:
 
 
 def checkpoint_folder(key: str) -> Path:
-    """Where an unfinished adaptation of this identity keeps its resume points."""
+    """Where unfinished work of this identity keeps its resume points."""
     return project_root() / ".cache" / "ckpt" / key
+
+
+def run_identity(sections: object, inputs: Sequence[Path]) -> str:
+    """Key of the resume points: configuration and input bytes. Another run never finds them."""
+    digest = hashlib.sha256(repr(sections).encode())
+    for folder in inputs:
+        for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+            digest.update(f"{path.as_posix()}\n".encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:32]
 
 
 def stage(*axes: str) -> Callable[[Callable[[Cell], None]], Callable[[], None]]:

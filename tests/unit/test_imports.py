@@ -21,6 +21,7 @@ ROOMS: dict[str, set[str]] = {
     "ingest": {"artifacts", "geometry"},
     "generation": {"artifacts", "geometry", "ingest", "splatting"},
     "adaptation": {"artifacts", "geometry", "models", "splatting"},
+    "optimisation": {"artifacts", "evaluation", "geometry", "splatting"},
     "inference": {"artifacts", "geometry", "models"},
     "expansion": {"adaptation", "artifacts", "frontend", "geometry", "inference", "models"},
     "evaluation": {"artifacts", "geometry", "splatting"},

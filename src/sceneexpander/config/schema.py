@@ -13,6 +13,7 @@ from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import GeneratorConfig
 from sceneexpander.inference.rivals import RivalsConfig
 from sceneexpander.ingest import IngestConfig
+from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.rendering import RenderConfig
 from sceneexpander.tracking import TrackingConfig
 
@@ -31,6 +32,7 @@ class ProjectConfig:
     warmup: WarmupConfig
     adapt: AdaptConfig
     rivals: RivalsConfig
+    optimise: OptimiseConfig
     render: RenderConfig
     evaluate: EvaluateConfig
     tracking: TrackingConfig

@@ -11,10 +11,12 @@ precision.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 WINDOW = 11
 SIGMA = 1.5
@@ -46,7 +48,17 @@ def ssim_map(
     image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
 ) -> Float[Tensor, "3 valid_height valid_width"]:
     """Structural similarity at every window position inside the image: position (y, x) is the window around pixel (y + 5, x + 5)."""
-    a, b = _checked(image, reference)
+    return similarity(*_checked(image, reference))
+
+
+def similarity(
+    a: Float[Tensor, "3 height width"], b: Float[Tensor, "3 height width"]
+) -> Float[Tensor, "3 valid_height valid_width"]:
+    """`ssim_map` in the precision of what is given and differentiable, without checks and clamping: also a loss.
+
+    Raises:
+        ValueError: the images are smaller than the window.
+    """
     if min(a.shape[1:]) < WINDOW:
         raise ValueError(f"ssim needs at least {WINDOW} x {WINDOW} pixels, got {tuple(a.shape[1:])}")
     planes = torch.cat([a, b, a * a, b * b, a * b])
@@ -79,11 +91,37 @@ def ssim(
 
 
 def _windowed(planes: Float[Tensor, "plane height width"]) -> Float[Tensor, "plane valid_height valid_width"]:
-    offsets = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
+    offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
     weights = torch.exp(-(offsets**2) / (2 * SIGMA**2))
-    weights = weights / weights.sum()
-    rows = torch.nn.functional.conv2d(planes[:, None], weights[None, None, :, None])
-    return torch.nn.functional.conv2d(rows, weights[None, None, None, :])[:, 0]
+    return _Separable.apply(planes, (weights / weights.sum()).tolist())  # type: ignore[no-untyped-call]
+
+
+class _Separable(torch.autograd.Function):
+    """Weighted sums over windows along both axes. Sums of shifted images: many times faster on a CPU than convolutions of one channel."""
+
+    @staticmethod
+    def forward(ctx: Any, planes: Tensor, weights: list[float]) -> Tensor:
+        ctx.weights = weights
+        for axis in (-2, -1):
+            length = planes.shape[axis] - len(weights) + 1
+            total = planes.narrow(axis, 0, length) * weights[0]
+            for shift, weight in enumerate(weights[1:], 1):
+                total.add_(planes.narrow(axis, shift, length), alpha=weight)
+            planes = total
+        return planes
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        for axis in (-1, -2):
+            length = gradient.shape[axis]
+            shape = list(gradient.shape)
+            shape[axis] += len(ctx.weights) - 1
+            total = gradient.new_zeros(shape)
+            for shift, weight in enumerate(ctx.weights):
+                total.narrow(axis, shift, length).add_(gradient, alpha=weight)
+            gradient = total
+        return gradient, None
 
 
 def _checked(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,9 @@ from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.store import to_plain
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.inference.rivals import RivalConfig, RivalsConfig
 from sceneexpander.ingest import IngestConfig
+from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.rendering import RenderConfig
 
 CONF = Path(__file__).parents[3] / "conf"
@@ -22,6 +24,8 @@ CONF = Path(__file__).parents[3] / "conf"
         ("adapt", AdaptConfig()),
         ("evaluate", EvaluateConfig()),
         ("scene", IngestConfig()),
+        ("optimise", OptimiseConfig()),
+        ("rivals", RivalsConfig(omnivggt=RivalConfig(), ttt3r=RivalConfig(long_side_px=512))),
         ("render", RenderConfig()),
     ],
 )

@@ -81,6 +81,20 @@ def filled(path: str) -> str:
             "rival",
             [layout.reconstruction("S", 2, "backbone").parent, layout.statistics("rival", "S", 2, "backbone")],
         ),
+        (
+            "gaussian_splatting",
+            [
+                layout.reconstruction("S", 2, layout.SPLATTED).parent,
+                layout.statistics("gaussian_splatting", "S", 2, layout.SPLATTED),
+            ],
+        ),
+        (
+            "optimise",
+            [
+                layout.reconstruction("S", 2, "backbone_optimised").parent,
+                layout.statistics("optimise", "S", 2, "backbone_optimised"),
+            ],
+        ),
         ("render", [layout.renders("S", 2, "backbone"), layout.statistics("render", "S", 2, "backbone")]),
         ("pack", [layout.packed("S", 2, "backbone"), layout.statistics("pack", "S", 2, "backbone")]),
         ("evaluate", [layout.metrics("S", 2, "backbone"), layout.statistics("evaluate", "S", 2, "backbone")]),
@@ -109,4 +123,5 @@ def test_selected_methods_exist() -> None:
     params = yaml.safe_load((ROOT / "params.yaml").read_text())
     assert set(params["methods"]) <= set(layout.METHODS)
     assert PIPELINE["rival"]["matrix"]["method"] == list(layout.RIVALS)
+    assert PIPELINE["optimise"]["matrix"]["method"] == list(layout.OPTIMISABLE)
     assert [item["prev"] for item in params["rounds"]] == [item["k"] - 1 for item in params["rounds"]]

@@ -1,0 +1,54 @@
+"""Resume points of a running optimisation: tensors, the step, and the run that they belong to."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from sceneexpander.artifacts.store import ArtifactError, directory_being_written, load_artifact, save_artifact
+
+SCHEMA = "optimisation-checkpoint/1"
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OptimisationCheckpoint:
+    """State after ``step`` finished steps. All random draws follow from seed and step number, so nothing else is needed."""
+
+    run_key: str  # what determines the run
+    step: int
+    losses: list[float]
+    splats: dict[str, Tensor]
+    density: dict[str, Tensor]
+    cameras: dict[str, Tensor]
+
+    def save(self, folder: Path) -> None:
+        """Replace the checkpoint in ``folder`` atomically."""
+        tensors: dict[str, Tensor] = {}
+        for part in ("splats", "density", "cameras"):
+            tensors |= {f"{part}/{name}": value for name, value in getattr(self, part).items()}
+        facts = {"run_key": self.run_key, "step": self.step, "losses": self.losses}
+        with directory_being_written(folder) as scratch:
+            save_artifact(scratch, SCHEMA, facts, tensors)
+
+    @classmethod
+    def load(cls, folder: Path, run_key: str) -> OptimisationCheckpoint | None:
+        """The checkpoint of this very run, or None if there is none (damaged ones are reported and ignored)."""
+        if not folder.exists():
+            return None
+        try:
+            facts, tensors = load_artifact(folder, SCHEMA)
+        except ArtifactError as error:
+            _log.warning("ignoring a damaged checkpoint: %s", error.line())
+            return None
+        if facts["run_key"] != run_key:
+            _log.warning("ignoring a checkpoint of another run in %s", folder)
+            return None
+        parts: dict[str, dict[str, Tensor]] = {"splats": {}, "density": {}, "cameras": {}}
+        for key, value in tensors.items():
+            part, _, name = key.partition("/")
+            parts[part][name] = value
+        return cls(run_key=run_key, step=facts["step"], losses=facts["losses"], **parts)

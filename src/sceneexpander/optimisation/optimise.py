@@ -1,0 +1,239 @@
+"""The optimisation of one scene: views in, a better reconstruction in the same gauge out."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.evaluation.image import similarity
+from sceneexpander.geometry.camera import camera_vector_from_pose
+from sceneexpander.geometry.normals import normals_from_depth
+from sceneexpander.geometry.randomness import child_generator
+from sceneexpander.optimisation.cameras import RefinedCameras
+from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
+from sceneexpander.optimisation.config import OptimiseConfig
+from sceneexpander.optimisation.density import CloneAndSplit, DensityControl, Relocation, Seen
+from sceneexpander.optimisation.splats import Splats, thinned
+from sceneexpander.splatting import rasterise, render
+
+FEWEST_VIEWS = 2  # with known cameras: one view alone says nothing about where things are
+_COVERED = 0.5  # alpha above which a pixel's rendered depth means something
+_EXTENT_MARGIN = 1.1
+_LEAST_EXTENT = 0.1  # of the median depth: cameras close together still look at a scene of some size
+_DEGREE_SHARE = 1 / 30  # of the steps, before the colours may depend on the direction one degree more
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OptimisationResult:
+    """The optimised scene and the loss of every step."""
+
+    reconstruction: Reconstruction
+    losses: tuple[float, ...]
+
+
+def scene_extent(reconstruction: Reconstruction) -> float:
+    """Unit of positions: 1.1 times the distance of the farthest known camera from their mean, at least a tenth of the median depth."""
+    known = reconstruction.posed
+    centres = reconstruction.world_from_cam[known, :3, 3]
+    radius = float((centres - centres.mean(0)).norm(dim=-1).max())
+    return max(_EXTENT_MARGIN * radius, _LEAST_EXTENT * float(reconstruction.depth[known].median()))
+
+
+def optimise(
+    start: Reconstruction,
+    images: Float[Tensor, "view 3 height width"],
+    config: OptimiseConfig,
+    *,
+    method: str,
+    seed: int,
+    device: torch.device | str = "cpu",
+    checkpoint_folder: Path | None = None,
+    on_step: Callable[[int, float], None] | None = None,
+) -> OptimisationResult:
+    """Optimise the Gaussians of ``start`` on the pictures of its views, generated ones included, on black.
+
+    Views without a known camera are left out. On a CPU the same input gives the same bits, interrupted or not.
+
+    Args:
+        start: cameras and Gaussians to start from.
+        images: pictures of its views, in order, RGB in [0, 1], at its size.
+        config: settings.
+        method: name of the result.
+        seed: of every random draw.
+        device: where to work.
+        checkpoint_folder: resume points; None: none are kept.
+        on_step: told the number of finished steps and the last loss.
+
+    Raises:
+        ValueError: fewer than `FEWEST_VIEWS` views have known cameras, or sizes do not fit.
+    """
+    if int(start.posed.sum()) < FEWEST_VIEWS or images.shape[2:] != start.depth.shape[1:]:
+        raise ValueError(
+            f"{int(start.posed.sum())} posed views of {tuple(images.shape)} pictures cannot be optimised on"
+        )
+    run = _Run(start, images, config, seed=seed, device=torch.device(device))
+    first = run.resume(checkpoint_folder)
+    if first:
+        _log.info("resumed the optimisation after step %d", first)
+    for step in range(first + 1, config.steps + 1):
+        loss = run.step(step)
+        if checkpoint_folder is not None and step % config.checkpoint_every == 0 and step < config.steps:
+            run.checkpoint(step).save(checkpoint_folder)
+        if on_step is not None:
+            on_step(step, loss)
+    return OptimisationResult(reconstruction=run.result(method), losses=tuple(run.losses))
+
+
+class _Run:
+    """What changes from step to step."""
+
+    def __init__(
+        self,
+        start: Reconstruction,
+        images: Float[Tensor, "view 3 height width"],
+        config: OptimiseConfig,
+        *,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self._start, self._config, self._seed, self._device = start, config, seed, device
+        self._images = images.to(device)
+        self._intrinsics = start.intrinsics_px.to(device)
+        self._views = start.posed.nonzero()[:, 0].tolist()
+        self._extent = scene_extent(start)
+        kept = thinned(start.gaussians, config.start_gaussians, child_generator(seed, "optimise/start"))
+        self.splats = Splats.of(kept.to(device), config.rates, extent=self._extent, sh_degree=config.sh_degree)
+        self._cameras = RefinedCameras(start.world_from_cam.to(device), rate=config.rates.poses, extent=self._extent)
+        self._density = density_control(config, extent=self._extent, device=device)
+        self.losses: list[float] = []
+        self._key = _run_key(start, images, config, seed)
+
+    def step(self, step: int) -> float:
+        """One view, one update."""
+        view = self._view_of(step)
+        rate = self._set_mean_rate(step)
+        height, width = self._images.shape[2:]
+        splats = self.splats
+        offsets = torch.zeros(1, len(splats), 2, device=self._device, requires_grad=True)
+        seen = rasterise(
+            splats.params["means"],
+            splats.params["quats"],
+            splats.scales,
+            splats.opacities,
+            splats.colours(self._degree(step)),
+            self._cameras.cam_from_world(view),
+            self._intrinsics[view : view + 1],
+            height,
+            width,
+            screen_offsets=offsets,
+            with_depth=False,
+        )
+        loss = photometric_loss(seen.rgb[0], self._images[view], self._config.ssim_weight)
+        (loss + self._density.penalty(splats)).backward()  # type: ignore[no-untyped-call]
+        assert offsets.grad is not None  # noqa: S101 - every picture depends on them
+        facts = Seen(centre_gradient=offsets.grad[0], radius_px=seen.radius_px[0], height=height, width=width)
+        self._density.observe(splats, facts, step)
+        splats.step()
+        self._cameras.step()
+        generator = child_generator(self._seed, f"optimise/density/{step}")
+        self._density.change(splats, step, mean_rate=rate, generator=generator)
+        self.losses.append(float(loss.detach()))
+        return self.losses[-1]
+
+    def _view_of(self, step: int) -> int:
+        """Every view once before any comes again, in a new order each time."""
+        turn, place = divmod(step - 1, len(self._views))
+        order = torch.randperm(len(self._views), generator=child_generator(self._seed, f"optimise/order/{turn}"))
+        return int(self._views[int(order[place])])
+
+    def _set_mean_rate(self, step: int) -> float:
+        rates = self._config.rates
+        share = (step - 1) / max(self._config.steps - 1, 1)
+        rate = self._extent * rates.means * (rates.means_final / rates.means) ** share
+        self.splats.optimisers["means"].param_groups[0]["lr"] = rate
+        return rate
+
+    def _degree(self, step: int) -> int:
+        return min(self._config.sh_degree, int((step - 1) / max(self._config.steps * _DEGREE_SHARE, 1)))
+
+    def checkpoint(self, step: int) -> OptimisationCheckpoint:
+        """The state after a step."""
+        return OptimisationCheckpoint(
+            run_key=self._key,
+            step=step,
+            losses=self.losses,
+            splats=self.splats.state(),
+            density=self._density.state(),
+            cameras=self._cameras.state(),
+        )
+
+    def resume(self, folder: Path | None) -> int:
+        """Take up this very run's last resume point, if there is one; the number of steps it had done."""
+        saved = None if folder is None else OptimisationCheckpoint.load(folder, self._key)
+        if saved is None:
+            return 0
+        self.splats.restore(saved.splats)
+        self._density.restore({name: value.to(self._device) for name, value in saved.density.items()})
+        self._cameras.restore(saved.cameras)
+        self.losses = list(saved.losses)
+        return saved.step
+
+    @torch.no_grad()
+    def result(self, method: str) -> Reconstruction:
+        """The scene as an artefact: depth as the Gaussians show it, and the start's where they show nothing."""
+        start, gaussians = self._start, self.splats.gaussians()
+        poses = self._cameras.world_from_cam().cpu()
+        height, width = start.depth.shape[1:]
+        depth = start.depth.clone()
+        for view in self._views:
+            one = slice(view, view + 1)
+            seen = render(gaussians.to(self._device), poses[one].to(self._device), self._intrinsics[one], height, width)
+            shown = (seen.alpha > _COVERED) & (seen.depth > 0)
+            depth[one] = torch.where(shown.cpu(), seen.depth.cpu(), depth[one])
+        return replace(
+            start,
+            method=method,
+            gaussians=gaussians,
+            world_from_cam=poses,
+            camera_vector=camera_vector_from_pose(poses, start.intrinsics_px, height, width),
+            depth=depth,
+            normals=normals_from_depth(depth, start.intrinsics_px),
+            normals_conf=start.depth_conf,
+        )
+
+
+def photometric_loss(
+    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"], ssim_weight: float
+) -> Float[Tensor, ""]:
+    """(1 - w) mean absolute error + w (1 - SSIM)."""
+    error = (image - reference).abs().mean()
+    if ssim_weight == 0:
+        return error
+    return (1 - ssim_weight) * error + ssim_weight * (1 - similarity(image, reference).mean())
+
+
+def density_control(config: OptimiseConfig, *, extent: float, device: torch.device) -> DensityControl:
+    """The configured strategy: ours on a CPU, gsplat's on CUDA."""
+    if device.type == "cuda":
+        from sceneexpander.optimisation.gsplat_density import GsplatControl
+
+        return GsplatControl(config.density, config.steps, extent=extent)
+    if config.density.strategy == "mcmc":
+        return Relocation(config.density, config.steps)
+    return CloneAndSplit(config.density, config.steps, extent=extent)
+
+
+def _run_key(start: Reconstruction, images: Tensor, config: OptimiseConfig, seed: int) -> str:
+    digest = hashlib.sha256(f"{config!r}:{seed}".encode())
+    for value in (images, start.gaussians.means, start.gaussians.sh, start.world_from_cam):
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

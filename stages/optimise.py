@@ -1,0 +1,88 @@
+"""optimise: 3DGS after the fact, started from the cameras and Gaussians that a method made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.unavailable import Unavailable, unavailable_in
+from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.config.files import read_sections
+from sceneexpander.optimisation.config import OptimiseConfig
+from sceneexpander.optimisation.optimise import FEWEST_VIEWS, optimise
+from sceneexpander.progress import progress_bar
+from stages import layout
+from stages.runner import Cell, checkpoint_folder, left_out, remove_folder, run_identity, stage, use_threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sections:
+    """What this stage reads of the configuration."""
+
+    seed: int
+    device: str
+    threads: int
+    optimise: OptimiseConfig
+
+
+def optimise_from(cell: Cell, start: str) -> None:
+    """Make the cell's method from the method ``start``, or write down why it cannot be."""
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_threads(sections.threads)
+    made = layout.reconstruction(cell.scene, cell.round, start)
+    target = layout.reconstruction(cell.scene, cell.round, cell.method).parent
+    lacking = unavailable_in(made)
+    if lacking is not None:
+        _write_reason(Unavailable(method=cell.method, model=lacking.model, reason=lacking.reason), target)
+        return
+    reconstruction = Reconstruction.load(made)
+    if int(reconstruction.posed.sum()) < FEWEST_VIEWS:
+        reason = f"needs {FEWEST_VIEWS} views with known cameras"
+        _write_reason(Unavailable(method=cell.method, model=reconstruction.model, reason=reason), target)
+        return
+    sources = (
+        layout.state(cell.scene, cell.previous) / "views",
+        layout.inserted(cell.scene, cell.round),
+        made,
+    )
+    views = ViewSet.load(sources[0]).append(InsertedView.load(sources[1]).view)
+    checkpoints = checkpoint_folder(run_identity(sections, sources))
+    config = sections.optimise
+    with (
+        directory_being_written(target) as folder,
+        progress_bar(f"optimise {cell.scene} {cell.method}", config.steps * config.repeats) as bar,
+    ):
+        for repeat in range(config.repeats):
+            result = optimise(
+                reconstruction,
+                views.images,
+                config,
+                method=cell.method,
+                seed=sections.seed + repeat,
+                device=sections.device,
+                checkpoint_folder=checkpoints / str(repeat),
+                on_step=lambda step, loss, done=repeat * config.steps: bar.update(done + step, loss),  # type: ignore[misc]
+            )
+            place = folder / layout.repeat_name(repeat)
+            result.reconstruction.save(place)
+            write_json_atomic(place / "losses.json", result.losses)
+    remove_folder(checkpoints)
+
+
+def _write_reason(reason: Unavailable, target: Path) -> None:
+    with directory_being_written(target) as folder:
+        reason.save(folder / "reconstruction")
+
+
+@stage("scene", "round", "previous", "method")
+def main(cell: Cell) -> None:
+    """The method's name says what it starts from."""
+    if not left_out(cell):
+        optimise_from(cell, cell.method.removesuffix("_optimised"))
+
+
+if __name__ == "__main__":
+    main()
