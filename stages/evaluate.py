@@ -13,6 +13,7 @@ from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.files import read_sections
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import Navigation, evaluate
+from sceneexpander.evaluation.repeats import over_repeats
 from sceneexpander.evaluation.truth import load_truth
 from stages import layout
 from stages.runner import Cell, stage, use_threads
@@ -47,22 +48,26 @@ def main(cell: Cell) -> None:
     before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
     views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
     renders = Renders.load(layout.renders(cell.scene, cell.round, cell.method))
-    row = evaluate(
-        Reconstruction.load(made),
-        views,
-        sections.evaluate,
-        scene=cell.scene,
-        round_number=cell.round,
-        seed=sections.seed,
-        navigation=Navigation(
-            world_from_cam=renders.world_from_cam,
-            intrinsics_px=renders.intrinsics_px,
-            height=renders.height,
-            width=renders.width,
-        ),
-        truth=load_truth(layout.source(cell.scene)),
-    )
-    row.save(layout.metrics(cell.scene, cell.round, cell.method))
+    runs = [made, *sorted(made.parent.glob(layout.REPEATS))]
+    rows = [
+        evaluate(
+            Reconstruction.load(run),
+            views,
+            sections.evaluate,
+            scene=cell.scene,
+            round_number=cell.round,
+            seed=sections.seed,
+            navigation=Navigation(
+                world_from_cam=renders.world_from_cam,
+                intrinsics_px=renders.intrinsics_px,
+                height=renders.height,
+                width=renders.width,
+            ),
+            truth=load_truth(layout.source(cell.scene)),
+        )
+        for run in runs
+    ]
+    over_repeats(rows).save(layout.metrics(cell.scene, cell.round, cell.method))
 
 
 if __name__ == "__main__":

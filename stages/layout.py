@@ -13,6 +13,7 @@ OURS = ("captured", "backbone", "sceneexpander")  # always made: the pipeline it
 RIVALS = ("omnivggt", "ttt3r")  # networks of others
 SPLATTED = "gaussian_splatting"  # per-scene optimisation, started from the backbone
 OPTIMISABLE = ("sceneexpander", *RIVALS)  # what an optimisation after the fact can start from
+REPEATS = "repeat_*"
 METHODS = (*OURS, SPLATTED, *RIVALS, *(f"{method}_optimised" for method in OPTIMISABLE))
 
 
@@ -52,8 +53,8 @@ def reconstruction(scene: str, number: int, method: str) -> Path:
 
 
 def repeat_name(repeat: int) -> str:
-    """Folder, beside the reconstruction, of a method's further runs with other seeds; the first run is the reconstruction."""
-    return f"repeat_{repeat}" if repeat else "reconstruction"
+    """Folder of one of a method's runs with different seeds: the first is the reconstruction, further ones lie beside it."""
+    return REPEATS.replace("*", str(repeat)) if repeat else "reconstruction"
 
 
 def inserted(scene: str, number: int) -> Path:

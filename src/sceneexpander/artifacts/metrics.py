@@ -59,6 +59,9 @@ class TruthMetrics:
 class MetricsRow:
     """One method's result on one scene. Means are over views; None means not known or not applicable, never zero.
 
+    Of a method that was run several times with other seeds, the numbers are means over the ``repeats`` and ``spread`` holds their standard
+    deviations (n - 1) by name (see `value`); ``views`` are those of the first run.
+
     ``psnr_db`` and ``ssim`` are over the captured views (preservation), ``inserted_`` over the view inserted in this round.
     ``navigation_coverage`` is the mean share of covered pixels over the frames of the navigation.
     """
@@ -85,6 +88,8 @@ class MetricsRow:
     navigation_coverage: float | None = None
     navigation_frames: int = 0
     truth: TruthMetrics | None = None
+    repeats: int = 1
+    spread: dict[str, float] = field(default_factory=dict)
     views: tuple[ViewMetrics, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
 
@@ -114,7 +119,7 @@ class MetricsRow:
                 value = getattr(holder, f.name)
                 if isinstance(value, (int, float)) and not isinstance(value, bool) and f.name not in {"round", "seed"}:
                     found[prefix + f.name] = float(value)
-        return found
+        return found | {f"spread_{name.replace('.', '_')}": value for name, value in self.spread.items()}
 
     def save(self, path: Path) -> None:
         """Write as a JSON file, atomically."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -81,6 +82,7 @@ def comparison_table(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -
     A method that could be run in no cell has its reason in the first number's place.
 
     A mean over fewer cells than there are is followed by its count, e.g. ``21.40 (3/4)``; without any value the cell says ``missing``.
+    Of methods that were run several times, the standard deviation over the runs follows (root mean square over the cells).
     Columns that no row has a value for are left out. Means of lines with different counts cannot be compared.
 
     Raises:
@@ -174,4 +176,9 @@ def _cell_text(by_key: dict[tuple[Cell, str], MetricsRow], cells: Sequence[Cell]
     if not values:
         return MISSING
     text = f"{sum(values) / len(values):.{column.digits}f}"
+    spreads = [
+        row.spread[column.name] for cell in cells if (row := by_key.get((cell, method))) and column.name in row.spread
+    ]
+    if spreads:
+        text += f" ± {math.sqrt(sum(value * value for value in spreads) / len(spreads)):.{column.digits}f}"
     return text if len(values) == len(cells) else f"{text} ({len(values)}/{len(cells)})"

@@ -96,7 +96,9 @@ def _table_row(method: Mapping[str, Any], rows: Mapping[str, MetricsRow], column
         rivals = {name: round(v, column.digits + 2 * column.percent) for name, v in _known(rows, column).items()}
         best = (max if column.better == "higher" else min)(rivals.values(), default=None)
         wins = len(set(rivals.values())) > 1 and rivals.get(method["name"]) == best
-        cells.append({"text": _number(value, column), "best": wins})
+        spread = rows[method["name"]].spread.get(column.name)
+        text = _number(value, column) + ("" if spread is None else f" \u00b1 {_number(spread, column)}")
+        cells.append({"text": text, "best": wins})
     return {"name": method["name"], "label": words.label, "meaning": words.meaning, "cells": cells}
 
 

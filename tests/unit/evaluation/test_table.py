@@ -9,6 +9,7 @@ import pytest
 
 from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics, UnavailableRow
 from sceneexpander.evaluation import comparison_table, scene_table
+from sceneexpander.evaluation.repeats import over_repeats
 
 
 def row(scene: str, method: str, psnr_db: float, **more: object) -> MetricsRow:
@@ -69,6 +70,26 @@ def test_a_method_that_could_not_be_run_has_its_reason_in_the_line() -> None:
     assert ["b", "1", "0", "TTT3R (pixel-aligned Gaussians)", "missing", "missing"] in per_scene
     with pytest.raises(ValueError, match="two rows"):
         comparison_table([lost, lost])
+
+
+def test_repeats_become_a_mean_with_its_spread() -> None:
+    truths = [TruthMetrics(depth_abs_rel=0.1), TruthMetrics(depth_abs_rel=0.2)]
+    runs = [
+        row("a", "gaussian_splatting", 20.0, gaussians=11, truth=truths[0], inserted_psnr_db=9.0),
+        row("a", "gaussian_splatting", 22.0, gaussians=12, truth=truths[1]),
+    ]
+    whole = over_repeats(runs)
+    assert (whole.repeats, whole.psnr_db, whole.gaussians) == (2, 21.0, 11)
+    assert whole.spread["psnr_db"] == pytest.approx(2**0.5)
+    assert whole.value("truth.depth_abs_rel") == pytest.approx(0.15)
+    assert whole.spread["truth.depth_abs_rel"] == pytest.approx(0.1 / 2**0.5)
+    assert whole.inserted_psnr_db is None, "one run lacks it"
+    assert "inserted_psnr_db" not in whole.spread
+    assert whole.numbers()["spread_psnr_db"] == pytest.approx(2**0.5)
+    assert cells(comparison_table([whole]).csv())[1][2] == "21.00 ± 1.41"
+    assert over_repeats(runs[:1]) is runs[0]
+    with pytest.raises(ValueError, match="one scene"):
+        over_repeats([runs[0], row("b", "gaussian_splatting", 1.0)])
 
 
 def test_gaps_are_shown_not_averaged_over() -> None:

@@ -130,7 +130,7 @@ def test_cameras_stay_unless_they_may_move_and_then_they_move_the_right_way() ->
         a, b = (project_points(means[1200:2300], world.intrinsics_px[1], pose)[0] for pose in poses)
         return float((a - b).norm(dim=-1).mean())
 
-    fixed = {name: 1e-9 for name in ("means", "means_final", "scales", "rotations", "opacities", "colours")}
+    fixed = dict.fromkeys(("means", "means_final", "scales", "rotations", "opacities", "colours"), 1e-09)
     still = OptimiseConfig(steps=90, sh_degree=0, rates=RatesConfig(**fixed), density=DensityConfig(every=1000))
     free = replace(still, rates=RatesConfig(poses=5e-4, **fixed))
     results = [optimise(start, pictures, config, method="m", seed=0).reconstruction for config in (still, free)]
