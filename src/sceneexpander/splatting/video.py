@@ -134,10 +134,11 @@ def depth_range(
     usable = torch.isfinite(depth) & (depth > 0)
     if valid is not None:
         usable = usable & valid
-    values = depth.detach()[usable].sort().values
+    values = depth.detach()[usable].cpu().numpy()
     if not len(values):
         return 1.0, 1.0
     low, high = (round(p / 100 * (len(values) - 1)) for p in percentiles)
+    values.partition([low, high])  # a copy of its own already; sorting all of a video would take a second
     return float(values[low]), float(values[high])
 
 
