@@ -15,7 +15,7 @@ from sceneexpander.errors import UserError, entry_point
 from sceneexpander.viewer.live import HOST, LiveViewer
 
 METHODS = ("captured", "backbone", "sceneexpander")  # the last one that exists is shown first
-LIMIT = 300_000
+LIMIT = 400_000
 
 
 def load_round(folder: Path, number: int) -> tuple[str, list[Reconstruction], dict[str, Tensor]]:

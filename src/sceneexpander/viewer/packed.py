@@ -4,6 +4,9 @@ Which ones: each Gaussian's weight is the sum, over all pixels of all the recons
 the pixel (its alpha times what light is left in front of it). Gaussians are ordered by that weight and the lightest are left out; those
 that enter no pixel go first. Any prefix of the packed order is therefore the best set of its size.
 
+How many: a surface that one view alone shows needs all its Gaussians, so too few leave holes there. The number grows until every one
+of the reconstruction's own views looks like that of all Gaussians (`FAITHFUL_DB`), or the page would become too large.
+
 Layout of `PackedSplats.data`, column after column, little-endian, ``count`` rows each:
 
 ====================  ======  ================================================================================================
@@ -32,15 +35,18 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError, load_artifact, require_tensor, save_artifact
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.rigid import rigid_inverse
-from sceneexpander.splatting import rasterise
+from sceneexpander.splatting import rasterise, render
 from sceneexpander.splatting.torch_backend import shade
 from sceneexpander.viewer.cameras import Cameras
 
-SCHEMA = "packed-splats/1"
-SPLATS_PER_METHOD = 200_000  # three methods stay below 15 MB of page
+SCHEMA = "packed-splats/2"
+SPLATS_PER_METHOD = 400_000  # at most: three methods stay below 30 MB of page
+FAITHFUL_DB = 33.0  # PSNR of the worst view against all Gaussians at which no more are added
+_FEWEST, _MORE = 150_000, 50_000  # where the search for the number begins, and its step
+_EQUAL_DB = 100.0
 BYTES_PER_SPLAT = 18
 _CAMERA_TENSORS = ("generated", "posed", "world_from_cam", "intrinsics_px", "focus")
-_FACTS = ("method", "model", "total", "origin", "reach", "log_scale_low", "log_scale_high")
+_FACTS = ("method", "model", "total", "worst_view_db", "origin", "reach", "log_scale_low", "log_scale_high")
 _LOG_SCALE_RANGE = 14.0  # a step of 5.6 % at most
 _HALF_ROOT = math.sqrt(0.5)
 _QUAT_STEPS = 1023
@@ -57,6 +63,7 @@ class PackedSplats:
     model: str
     cameras: Cameras
     total: int  # Gaussians of the reconstruction
+    worst_view_db: float  # PSNR against all of them, in the one of the method's own views where it is lowest
     origin: tuple[float, float, float]
     reach: float
     log_scale_low: float
@@ -140,7 +147,8 @@ def pack_splats(
         device: where the weights are computed.
     """
     cameras = Cameras.of(reconstruction)
-    order = torch.argsort(visible_weight(reconstruction, device=device), descending=True, stable=True)[:limit]
+    order = torch.argsort(visible_weight(reconstruction, device=device), descending=True, stable=True)
+    order, worst_view_db = _enough(reconstruction, order, limit, device)
     colours = _colours(reconstruction)[order]
     scene = reconstruction.gaussians.detach().select(order)
     seen = cameras.captured()
@@ -167,6 +175,7 @@ def pack_splats(
         model=reconstruction.model,
         cameras=cameras,
         total=len(reconstruction.gaussians),
+        worst_view_db=worst_view_db,
         origin=(float(origin[0]), float(origin[1]), float(origin[2])),
         reach=reach,
         log_scale_low=low,
@@ -194,6 +203,34 @@ def unpack_splats(packed: PackedSplats) -> Gaussians:
         source_view=torch.full((count,), -1, dtype=torch.int64),
         generated=torch.from_numpy(octets[7] != 0),
     )
+
+
+@torch.no_grad()
+def _enough(
+    reconstruction: Reconstruction, order: Int[Tensor, " gaussian"], limit: int, device: torch.device | str
+) -> tuple[Int[Tensor, " kept"], float]:
+    """(the shortest tried prefix of ``order`` whose views are faithful, PSNR of its worst view)."""
+    height, width = reconstruction.depth.shape[1:]
+    scene = reconstruction.gaussians.detach().to(device)
+    poses, lenses = reconstruction.world_from_cam.to(device), reconstruction.intrinsics_px.to(device)
+
+    def pictures(gaussians: Gaussians) -> list[Float[Tensor, "3 height width"]]:
+        cameras = zip(poses, lenses, strict=True)
+        return [render(gaussians, pose[None], lens[None], height, width).rgb[0].clamp(0, 1) for pose, lens in cameras]
+
+    wanted = pictures(scene)
+    count = min(_FEWEST, limit)
+    while True:
+        kept = order[:count]
+        if len(kept) == len(order):
+            return kept, _EQUAL_DB
+        errors = [
+            float(((a - b) ** 2).mean()) for a, b in zip(pictures(scene.select(kept.to(device))), wanted, strict=True)
+        ]
+        worst = min(_EQUAL_DB, -10 * math.log10(max(*errors, 1e-12)))
+        if worst >= FAITHFUL_DB or count >= limit:
+            return kept, worst
+        count = min(count + _MORE, limit)
 
 
 def _steps(share: Float[Tensor, "*shape"], steps: int) -> Float[Tensor, "*shape"]:

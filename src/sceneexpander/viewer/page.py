@@ -91,6 +91,7 @@ def _method(item: ShownMethod, main: Cameras) -> dict[str, Any]:
         "label": item.label,
         "count": splats.count,
         "total": splats.total,
+        "worst_view_db": splats.worst_view_db,
         "origin": splats.origin,
         "reach": splats.reach,
         "log_scale": [splats.log_scale_low, splats.log_scale_high],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,15 @@ from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.geometry.gaussians import Gaussians, concatenate
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.splatting import render
-from sceneexpander.viewer.packed import BYTES_PER_SPLAT, PackedSplats, pack_splats, unpack_splats, visible_weight
+from sceneexpander.viewer import packed as packed_module
+from sceneexpander.viewer.packed import (
+    BYTES_PER_SPLAT,
+    FAITHFUL_DB,
+    PackedSplats,
+    pack_splats,
+    unpack_splats,
+    visible_weight,
+)
 from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
 
 
@@ -72,6 +81,30 @@ def test_the_least_visible_are_left_out_and_nothing_is_seen_of_it() -> None:
     kept = unpack_splats(packed)
     assert bool((kept.means[:, 2] > 0).all())
     torch.testing.assert_close(see(wall, kept), see(wall, wall.gaussians), atol=4 / 255, rtol=0)
+
+
+def test_as_many_are_kept_as_the_worst_view_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packed_module, "_FEWEST", 10)
+    monkeypatch.setattr(packed_module, "_MORE", 10)
+    scene = random_scene(600)
+    packed = pack_splats(scene)
+    assert 10 < packed.count < packed.total == 600
+    assert packed.worst_view_db >= FAITHFUL_DB
+    order = torch.argsort(visible_weight(scene), descending=True, stable=True)
+
+    def worst(count: int) -> float:
+        error = (
+            see(scene, scene.gaussians).clamp(0, 1) - see(scene, scene.gaussians.select(order[:count])).clamp(0, 1)
+        ) ** 2
+        return -10 * math.log10(float(error.mean((1, 2, 3)).max()))
+
+    assert worst(packed.count) == pytest.approx(packed.worst_view_db, abs=0.01)
+    assert worst(packed.count - 10) < FAITHFUL_DB
+    cut = pack_splats(scene, limit=40)
+    assert cut.count == 40
+    assert cut.worst_view_db == pytest.approx(worst(40), abs=0.01)
+    assert cut.worst_view_db < FAITHFUL_DB
+    assert pack_splats(scene, limit=10**6).worst_view_db >= FAITHFUL_DB
 
 
 def test_weights_are_shares_of_pixels() -> None:

@@ -51,11 +51,11 @@ def test_counts_are_told(packed: PackedSplats) -> None:
     assert (shown["count"], shown["total"]) == (packed.count, 9999)
 
 
-def test_three_full_methods_stay_below_15_mb(packed: PackedSplats) -> None:
+def test_three_full_methods_stay_below_30_mb(packed: PackedSplats) -> None:
     noise = torch.randint(0, 256, (SPLATS_PER_METHOD * BYTES_PER_SPLAT,), generator=torch.Generator().manual_seed(1))
     full = replace(packed, data=noise.to(torch.uint8), total=2 * SPLATS_PER_METHOD)
     # Noise does not compress: no scene is larger. One method is made three times over to spare the test two compressions.
-    assert 3 * len(page_of(full)) < 15_000_000
+    assert 3 * len(page_of(full)) < 30_000_000
 
 
 def test_the_same_scene_gives_the_same_bytes(packed: PackedSplats) -> None:

@@ -349,7 +349,8 @@ function say() {
   const shown = Math.ceil(method.count * state.share);
   const dropped = method.total - shown;
   $("count").textContent = `${number(shown)} of ${number(method.total)} Gaussians` +
-    (dropped ? `; the ${number(dropped)} left out weigh least in the method's own views` : "") + ". Colours do not change with direction.";
+    (dropped ? `; the ${number(dropped)} left out weigh least in the method's own views` : "") +
+    (dropped && shown === method.count ? ` (${Math.floor(method.worst_view_db)} dB or better against all of them)` : "") + ". Colours do not change with direction.";
 }
 
 function orbit(dx, dy) {
