@@ -19,9 +19,7 @@ from sceneexpander.models.protocol import GEOMETRY_HEADS
 from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
 
 # The mid-size configuration and CPU seconds of the reference's recorded timing (B=1, 6 views, 168 x 224).
-MID_SIZE = WorldMirrorConfig(
-    dim=384, encoder_depth=12, encoder_heads=6, trunk_depth=8, trunk_heads=6, collect=(1, 3, 5, 7)
-)
+MID_SIZE = WorldMirrorConfig.mid()
 VIEWS, HEIGHT, WIDTH = 6, 168, 224
 PARAMETERS = 198_609_322
 RECORDED = {

@@ -23,6 +23,7 @@ ROOMS: dict[str, set[str]] = {
     "adaptation": {"artifacts", "geometry", "models", "splatting"},
     "optimisation": {"artifacts", "evaluation", "geometry", "splatting"},
     "inference": {"artifacts", "geometry", "models"},
+    "planning": {"adaptation", "geometry", "models"},
     "expansion": {"adaptation", "artifacts", "frontend", "geometry", "inference", "models"},
     "evaluation": {"artifacts", "geometry", "splatting"},
     "expandbench": {

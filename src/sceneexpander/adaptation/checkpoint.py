@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sceneexpander.artifacts.store import ArtifactError, directory_being_written, load_artifact, save_artifact
 
-SCHEMA = "adaptation-checkpoint/2"
+SCHEMA = "adaptation-checkpoint/3"
 _log = logging.getLogger(__name__)
 
 
@@ -27,6 +27,7 @@ class Checkpoint:
     step: int
     buckets: list[tuple[tuple[str, ...], dict[str, Tensor]]]
     records: list[dict[str, Any]]
+    looks: list[dict[str, Any]]
 
     def save(self, folder: Path) -> None:
         """Replace the checkpoint in ``folder`` atomically."""
@@ -35,6 +36,7 @@ class Checkpoint:
             "step": self.step,
             "names": [names for names, _ in self.buckets],
             "records": self.records,
+            "looks": self.looks,
         }
         tensors = {f"{i}/{key}": value for i, (_, parts) in enumerate(self.buckets) for key, value in parts.items()}
         with directory_being_written(folder) as scratch:
@@ -58,4 +60,10 @@ class Checkpoint:
             index, _, name = key.partition("/")
             parts[int(index)][name] = value
         buckets = [(tuple(names), part) for names, part in zip(facts["names"], parts, strict=True)]
-        return cls(run_key=run_key, step=facts["step"], buckets=buckets, records=facts["records"])
+        return cls(
+            run_key=run_key,
+            step=facts["step"],
+            buckets=buckets,
+            records=facts["records"],
+            looks=facts["looks"],
+        )

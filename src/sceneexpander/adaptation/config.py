@@ -72,8 +72,15 @@ class MomentsForm(StrEnum):
 class EngineConfig:
     """How the steps are computed, not what: memory against time. Only ``moments: int8`` changes results beyond rounding."""
 
+    checkpoint_activations: bool = False  # recompute activations in the backward pass
+    views_per_chunk: int = 0  # views that a dense head works on at once; 0: the model's own choice
+    compile: bool = False  # torch.compile of the transformer blocks; the first steps are slow
     start_on_host: bool = False  # keep theta_0 in host memory; of use on a GPU
     moments: MomentsForm = MomentsForm.FP32
+
+    def __post_init__(self) -> None:
+        if self.views_per_chunk < 0:
+            raise ValueError(f"adapt.engine.views_per_chunk must be >= 0, is {self.views_per_chunk}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,6 +149,7 @@ class AdaptConfig:
     warp_targets: bool = False  # move the anchors of a warped view with its pixels
     precision: Precision = Precision.FP32
     checkpoint_every: int = 25  # steps between resume points; 0: none
+    observe_every: int = 50  # steps between looks, see `sceneexpander.adaptation.observe`; 0: none
     engine: EngineConfig = field(default_factory=EngineConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
 
@@ -153,6 +161,7 @@ class AdaptConfig:
             (0 <= self.ema_momentum < 1, f"ema_momentum must be in [0, 1), is {self.ema_momentum}"),
             (0 <= self.restore_rate <= 1, f"restore_rate must be in [0, 1], is {self.restore_rate}"),
             (self.restore_interval >= 0, f"restore_interval must be >= 0, is {self.restore_interval}"),
+            (self.observe_every >= 0, f"observe_every must be >= 0, is {self.observe_every}"),
             (self.camera_huber > 0, f"camera_huber must be > 0, is {self.camera_huber}"),
             (self.lambda_splat >= 0, f"lambda_splat must be >= 0, is {self.lambda_splat}"),
             (self.splat_every >= 1, f"splat_every must be >= 1, is {self.splat_every}"),

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from sceneexpander.adaptation.config import AdaptConfig, DriftForm
@@ -24,7 +25,7 @@ from sceneexpander.models.protocol import as_module
 Model = TypeVar("Model", bound=object)
 
 # Small enough for a core's cache; on a GPU large enough for its bandwidth, and small beside the weights.
-BUCKET_ELEMENTS = {"cpu": 1 << 18, "cuda": 1 << 25}
+BUCKET_ELEMENTS = {"cpu": 1 << 18, "cuda": 1 << 23}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,9 +71,18 @@ class WeightLedger:
         teacher: a copy of it made by `teacher_of`.
         config: learning rate, momentum, drift, restoration, and how to keep things.
         seed: of restoration and rounding.
+        bucket_elements: weights per bucket; default: what suits the device (`BUCKET_ELEMENTS`).
     """
 
-    def __init__(self, student: nn.Module, teacher: nn.Module, config: AdaptConfig, *, seed: int) -> None:
+    def __init__(
+        self,
+        student: nn.Module,
+        teacher: nn.Module,
+        config: AdaptConfig,
+        *,
+        seed: int,
+        bucket_elements: int | None = None,
+    ) -> None:
         self.config, self.seed = config, seed
         self.parameters = {name: p for name, p in student.named_parameters() if p.requires_grad}
         self.teacher_parameters = dict(teacher.named_parameters())
@@ -80,6 +90,7 @@ class WeightLedger:
         if wrong:
             raise ValueError(f"adapted weights must be float32; {wrong[0]} is {self.parameters[wrong[0]].dtype}")
         self.device = next(student.parameters()).device
+        self.bucket_elements = bucket_elements or BUCKET_ELEMENTS.get(self.device.type, BUCKET_ELEMENTS["cuda"])
         self.buckets: list[Bucket] = []
         self.pending = set(self.parameters)
 
@@ -94,7 +105,7 @@ class WeightLedger:
         self.pending -= set(fresh)
         # Whole blocks first: then parameters keep their alignment, and eight-bit blocks do not mix two of them.
         fresh.sort(key=lambda name: self.parameters[name].numel() % BLOCK != 0)
-        for names in _split(fresh, self.parameters):
+        for names in _split(fresh, self.parameters, self.bucket_elements):
             self._add_bucket(names)
 
     def _add_bucket(self, names: tuple[str, ...]) -> None:
@@ -119,12 +130,18 @@ class WeightLedger:
             return student.clone()
         return student.cpu().pin_memory()
 
-    @torch.no_grad()
     def update(self, step: int) -> UpdateReport:
+        """Make the update and read what it did: the only transfer, everything before it runs ahead of the host."""
+        drift, squares, restored = self.apply(step).tolist()
+        return UpdateReport(drift=drift, gradient=squares**0.5, restored=int(restored))
+
+    @torch.no_grad()
+    def apply(self, step: int) -> Float[Tensor, "3"]:
         """Drift gradient, AdamW, EMA (Eq. ema) and every K steps restoration (Eq. restore), bucket by bucket.
 
         The gradient of ``lambda_reg * L_reg``, 2 lambda (theta - theta_0), is exact and cheap, so it is added here and not by
-        autograd. Gradients are consumed. A bucket without any gets no AdamW step, as in torch; the teacher still follows.
+        autograd. Returns the sum of (theta - theta_0)^2 before the step, the squared norm of the gradient, and how many elements
+        were restored. Gradients are consumed. A bucket without any gets no AdamW step, as in torch; the teacher still follows.
         """
         self.take_in()
         config = self.config
@@ -144,9 +161,7 @@ class WeightLedger:
             if due:
                 generator = child_generator(self.seed, f"adapt/restore/{step}/{index}", bucket.student.device)
                 restored.append(restore(bucket.student, start, config.restore_rate, generator))
-        # The only transfer: everything above runs ahead of the host.
-        totals = torch.stack([_total(values, self.device) for values in (drift, squares, restored)]).tolist()
-        return UpdateReport(drift=totals[0], gradient=totals[1] ** 0.5, restored=int(totals[2]))
+        return torch.stack([_total(values, self.device) for values in (drift, squares, restored)])
 
     def _gathered(self, bucket: Bucket) -> Tensor | None:
         """The gradients of a bucket in one tensor, taken from the parameters; None if there are none."""
@@ -190,12 +205,11 @@ def restore(weights: Tensor, start: Tensor, rate: float, generator: torch.Genera
     return mask.sum()
 
 
-def _split(names: Sequence[str], parameters: Mapping[str, Tensor]) -> Iterator[tuple[str, ...]]:
+def _split(names: Sequence[str], parameters: Mapping[str, Tensor], limit: int) -> Iterator[tuple[str, ...]]:
     """Runs of names whose parameters fill a bucket."""
     bucket: list[str] = []
     filled = 0
     for name in names:
-        limit = BUCKET_ELEMENTS.get(parameters[name].device.type, BUCKET_ELEMENTS["cuda"])
         if bucket and filled + parameters[name].numel() > limit:
             yield tuple(bucket)
             bucket, filled = [], 0

@@ -9,16 +9,16 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from sceneexpander.adaptation.checkpoint import Checkpoint
-from sceneexpander.adaptation.config import AdaptConfig, DriftForm, InsertedWeights, Precision
-from sceneexpander.adaptation.consistency import inserted_weights
-from sceneexpander.adaptation.inputs import AdaptationInputs, StepViews, ViewSource, geometry_of, run_key
-from sceneexpander.adaptation.ledger import WeightLedger, teacher_of
+from sceneexpander.adaptation.config import AdaptConfig, DriftForm
+from sceneexpander.adaptation.engine import autocast
+from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, run_key
+from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.losses import ViewGeometry
-from sceneexpander.adaptation.objective import NonFiniteLoss, anchor_targets, step_losses
+from sceneexpander.adaptation.objective import NonFiniteLoss
+from sceneexpander.adaptation.observe import Look, Observer, warnings_of
 from sceneexpander.adaptation.photometric import learn_from_photo
 from sceneexpander.adaptation.sampling import sample_batch
 from sceneexpander.models.protocol import Reconstructor, as_module
@@ -50,11 +50,12 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptationResult:
-    """theta* and the log. ``seconds`` is the wall time of the steps run by this call."""
+    """theta* and the log, on the host. ``seconds`` is the wall time of the steps run by this call."""
 
     student: dict[str, Tensor]
     teacher: dict[str, Tensor]
     records: tuple[StepRecord, ...]
+    looks: tuple[Look, ...]
     seconds: float
 
 
@@ -66,6 +67,8 @@ def adapt(
     seed: int,
     checkpoint_folder: Path | None = None,
     on_step: Callable[[StepRecord], None] | None = None,
+    on_look: Callable[[Look], None] | None = None,
+    looks_folder: Path | None = None,
 ) -> AdaptationResult:
     """Run Algorithm 1 and leave ``model`` with the adapted weights theta*.
 
@@ -76,73 +79,96 @@ def adapt(
         checkpoint_folder: where resume points live; an unfinished run with the same key continues from its last one. Removed at the end
             by the caller once the result is safe on disk.
         on_step: called with every step's record, resumed ones included.
+        on_look: the same with every look (each ``observe_every`` steps, before the first and after the last).
+        looks_folder: where looks leave their pictures.
 
     Raises:
         NonFiniteLoss: a loss term or the gradient is not finite.
     """
     key = run_key(model, inputs, config, seed)
     run = Run(model, inputs, config, seed)
-    records: list[StepRecord] = []
+    observer = Observer(run.learner, run.source, looks_folder)
+    log = RunLog(on_step=on_step, on_look=on_look)
     if checkpoint_folder is not None and (saved := Checkpoint.load(checkpoint_folder, key)) is not None:
-        records = run.resume(saved)
+        run.resume(saved, log)
         _log.info("resumed the adaptation after step %d", saved.step)
-        for record in records:
-            if on_step is not None:
-                on_step(record)
     started = time.perf_counter()
-    for step in range(len(records) + 1, config.steps + 1):
-        record = run.step(step)
-        records.append(record)
-        if on_step is not None:
-            on_step(record)
-        due = config.checkpoint_every and step % config.checkpoint_every == 0 and step < config.steps
+    for step in range(len(log.records), config.steps + 1):
+        if step > len(log.records):
+            log.add(run.step(step))
+        if _look_due(step, config) and step not in {look.step for look in log.looks}:
+            log.add(observer.look(step))
+        due = config.checkpoint_every and step and step % config.checkpoint_every == 0 and step < config.steps
         if checkpoint_folder is not None and due:
-            run.checkpoint(key, step, records).save(checkpoint_folder)
+            run.checkpoint(key, step, log).save(checkpoint_folder)
+    for warning in warnings_of(log.looks):
+        _log.warning("%s", warning)
     return AdaptationResult(
-        student={k: v.detach().clone() for k, v in as_module(run.model).state_dict().items()},
-        teacher={k: v.detach().clone() for k, v in as_module(run.teacher).state_dict().items()},
-        records=tuple(records),
+        student=_on_host(run.learner.model),
+        teacher=_on_host(run.learner.teacher),
+        records=tuple(log.records),
+        looks=tuple(log.looks),
         seconds=time.perf_counter() - started,
     )
 
 
+def _look_due(step: int, config: AdaptConfig) -> bool:
+    """Before the first step, every so many steps, and after the last."""
+    every = config.observe_every
+    return bool(every and config.steps) and (step % every == 0 or step == config.steps)
+
+
+class RunLog:
+    """Records and looks so far, told to whoever listens."""
+
+    def __init__(self, *, on_step: Callable[[StepRecord], None] | None, on_look: Callable[[Look], None] | None) -> None:
+        self.records: list[StepRecord] = []
+        self.looks: list[Look] = []
+        self.on_step, self.on_look = on_step, on_look
+
+    def add(self, entry: StepRecord | Look) -> None:
+        """Keep an entry and pass it on."""
+        if isinstance(entry, Look):
+            self.looks.append(entry)
+            if self.on_look is not None:
+                self.on_look(entry)
+            return
+        self.records.append(entry)
+        if self.on_step is not None:
+            self.on_step(entry)
+
+
 class Run:
-    """A running adaptation: student, teacher and the ledger of their weights."""
+    """A running adaptation: the learner and where its views come from."""
 
     def __init__(self, model: Reconstructor, inputs: AdaptationInputs, config: AdaptConfig, seed: int) -> None:
         if inputs.captured.shape[0] != len(inputs.anchors.view_ids):
             raise ValueError(f"{inputs.captured.shape[0]} captured views, {len(inputs.anchors.view_ids)} anchors")
-        self.model, self.inputs, self.config, self.seed = model, inputs, config, seed
-        self.teacher: Reconstructor = teacher_of(model)
+        self.inputs, self.config, self.seed = inputs, config, seed
+        anchors = ViewGeometry(
+            camera_vector=inputs.anchors.camera_vector, depth=inputs.anchors.depth, normals=inputs.anchors.normals
+        )
+        self.learner = Learner(model, anchors, config, seed=seed)
         self.source = ViewSource(model, inputs, config, seed=seed)
-        self.ledger = WeightLedger(as_module(model), as_module(self.teacher), config, seed=seed)
-        anchors = inputs.anchors
-        self.anchors = ViewGeometry(camera_vector=anchors.camera_vector, depth=anchors.depth, normals=anchors.normals)
 
     def step(self, step: int) -> StepRecord:
         """One pass of the loop body of Algorithm 1."""
-        config = self.config
+        config, ledger = self.config, self.learner.ledger
         batch = sample_batch(self.inputs.captured.shape[0], config, seed=self.seed, step=step)
-        views = self.source.views(batch, step)
-        # First the teacher: its activations are gone when the student's, which are kept, are made.
-        teacher, weights = self._teach(views, batch.captured) if batch.inserted else (None, None)
-        with self._autocast():
-            student = geometry_of(views.predict(self.model))
-        targets = anchor_targets(self.anchors, batch, views.grids, student, config)
-        losses = step_losses(student, targets, teacher, config, weights)
+        losses = self.learner.losses(self.source.views(batch, step), batch)
         values = losses.values(step)
         losses.objective.backward()  # type: ignore[no-untyped-call]
-        del student, losses
+        del losses  # and the activations with them
         splat = 0.0
         if config.lambda_splat > 0 and step % config.splat_every == 0:
-            with self._autocast():
+            with autocast(config, self.learner.device):
                 splat = learn_from_photo(
-                    self.model, self.inputs, config, inserted=batch.inserted, seed=self.seed, step=step
+                    self.learner.model, self.inputs, config, inserted=batch.inserted, seed=self.seed, step=step
                 )
-        done = self.ledger.update(step)
+        done = ledger.update(step)
         if not math.isfinite(done.gradient):
             raise NonFiniteLoss(f"the gradient is not finite at step {step}")
-        drift = done.drift if config.drift is DriftForm.SUM else done.drift / self.ledger.adapted
+        drift = done.drift if config.drift is DriftForm.SUM else done.drift / ledger.adapted
         return StepRecord(
             step=step,
             captured=len(batch.captured),
@@ -155,27 +181,24 @@ class Run:
             **values,
         )
 
-    def _teach(self, views: StepViews, captured: tuple[int, ...]) -> tuple[ViewGeometry, Tensor | None]:
-        """The EMA teacher's prediction of the inserted view, from the step's very views, and how its pixels count (None: alike)."""
-        with torch.inference_mode(), self._autocast():
-            prediction = views.predict(self.teacher)
-            taught = geometry_of(prediction).view(len(captured))
-            weights = None
-            if self.config.inserted_weights is InsertedWeights.CONSISTENT:
-                weights = inserted_weights(prediction, self.anchors.depth[list(captured)])
-        # As ordinary tensors, which a loss may keep.
-        return taught.clone(), None if weights is None else weights.clone()
-
-    def _autocast(self) -> torch.autocast:
-        device = self.inputs.captured.device.type
-        return torch.autocast(device, dtype=torch.bfloat16, enabled=self.config.precision is Precision.BF16)
-
-    def checkpoint(self, key: str, step: int, records: list[StepRecord]) -> Checkpoint:
+    def checkpoint(self, key: str, step: int, log: RunLog) -> Checkpoint:
         """Everything that step ``step + 1`` depends on."""
-        plain = [asdict(record) for record in records]
-        return Checkpoint(run_key=key, step=step, buckets=self.ledger.state(), records=plain)
+        return Checkpoint(
+            run_key=key,
+            step=step,
+            buckets=self.learner.ledger.state(),
+            records=[asdict(record) for record in log.records],
+            looks=[asdict(look) for look in log.looks],
+        )
 
-    def resume(self, saved: Checkpoint) -> list[StepRecord]:
-        """Take over a checkpoint's state; returns its records."""
-        self.ledger.load(saved.buckets)
-        return [StepRecord(**record) for record in saved.records]
+    def resume(self, saved: Checkpoint, log: RunLog) -> None:
+        """Take over a checkpoint's state and log."""
+        self.learner.ledger.load(saved.buckets)
+        for record in saved.records:
+            log.add(StepRecord(**record))
+        for look in saved.looks:
+            log.add(Look(**look))
+
+
+def _on_host(model: Reconstructor) -> dict[str, Tensor]:
+    return {name: value.detach().to("cpu", copy=True) for name, value in as_module(model).state_dict().items()}

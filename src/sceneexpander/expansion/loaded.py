@@ -80,7 +80,8 @@ def load_model(config: ModelConfig, device: torch.device | str = "cpu") -> Loade
         config.name, variant=config.variant, weights=config.weights, allow_download=config.allow_download
     )
     module = as_module(built.model).to(target)
-    base = {name: value.detach().clone() for name, value in module.state_dict().items()}
+    # On the host: a second copy of large weights has no place on a GPU.
+    base = {name: value.detach().to("cpu", copy=True) for name, value in module.state_dict().items()}
     return LoadedModel(
         model=built.model,
         base=base,

@@ -107,6 +107,20 @@ class PreparesInputs(Protocol):
         ...
 
 
+@runtime_checkable
+class SavesMemory(Protocol):
+    """A reconstructor that can trade time for memory without changing its numbers."""
+
+    def save_memory(self, *, checkpoint_activations: bool, views_per_chunk: int) -> None:
+        """Choose how activations are kept.
+
+        Args:
+            checkpoint_activations: recompute them in the backward pass.
+            views_per_chunk: views that a dense head works on at once; 0: the model's own choice.
+        """
+        ...
+
+
 def as_module(model: object) -> nn.Module:
     """The same object, seen as the module it is."""
     if not isinstance(model, nn.Module):

@@ -17,7 +17,9 @@ from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.store import sha256_of_tensors
 from tests.support.tiny_model import TinyReconstructor, tiny_images
 
-FAST = AdaptConfig(steps=8, learning_rate=1e-2, restore_interval=3, restore_rate=0.05, checkpoint_every=3)
+FAST = AdaptConfig(
+    observe_every=0, steps=8, learning_rate=1e-2, restore_interval=3, restore_rate=0.05, checkpoint_every=3
+)
 NO_AUGMENT = AugmentConfig(identity=1, global_affine=0, blockwise=0, global_and_block=0)
 
 

@@ -161,6 +161,7 @@ class DptHead(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
+        self.views_per_chunk = config.views_per_chunk
         self.names = names = DptNames() if names is None else names
         features, levels = config.features, len(config.factors)
         dims = (dim,) * levels if isinstance(dim, int) else tuple(dim)
@@ -228,7 +229,7 @@ class DptHead(nn.Module):
 
     def chunks(self, count: int) -> Iterator[slice]:
         """Slices of at most ``views_per_chunk`` views: they bound the memory and change no number."""
-        step = self.config.views_per_chunk
+        step = self.views_per_chunk
         return (slice(begin, min(begin + step, count)) for begin in range(0, count, step))
 
     def features(

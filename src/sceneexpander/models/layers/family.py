@@ -43,6 +43,11 @@ class BackboneModel(nn.Module, ABC):
         model.initialise(generator)
         return model
 
+    def save_memory(self, *, checkpoint_activations: bool, views_per_chunk: int) -> None:
+        """See `SavesMemory.save_memory`."""
+        self.checkpoint_activations = checkpoint_activations
+        set_views_per_chunk(self, views_per_chunk)
+
     @abstractmethod
     def initialise(self, generator: torch.Generator) -> None:
         """Draw every parameter anew."""
@@ -55,3 +60,10 @@ class BackboneModel(nn.Module, ABC):
 
     def _dense(self, head: DptHead, features: TrunkFeatures) -> Float[Tensor, "batch view channel height width"]:
         return dense_map(head, features, checkpoint=self.checkpoint_activations)
+
+
+def set_views_per_chunk(model: nn.Module, count: int) -> None:
+    """Let every dense head of a model work on ``count`` views at once; 0: as its configuration says."""
+    for module in model.modules():
+        if isinstance(module, DptHead):
+            module.views_per_chunk = count or module.config.views_per_chunk

@@ -17,9 +17,10 @@ from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import camera_vector_from_pose, pose_from_camera_vector, unproject_to_world
 from sceneexpander.geometry.normals import face_camera, viewing_rays
 from sceneexpander.geometry.priors import Priors
+from sceneexpander.models.layers.family import set_views_per_chunk
 from sceneexpander.models.mini.config import MiniConfig
 from sceneexpander.models.mini.inputs import MeasuredPriors, PreparedViews, measure, prepare
-from sceneexpander.models.mini.network import MiniNetwork
+from sceneexpander.models.mini.network import Features, MiniNetwork
 from sceneexpander.models.mini.splats import covered_by_others, pixel_aligned_gaussians
 from sceneexpander.models.protocol import ALL_HEADS, Head, Prediction
 from sceneexpander.models.weights import load_weights, resolve_weights
@@ -83,9 +84,23 @@ class Mini(nn.Module):
         generated: Bool[Tensor, "view"] | None = None,
     ) -> Prediction:
         """See `PreparesInputs.predict_prepared`."""
+        images = prepared.images
+        features = self.network.features(prepared.working)
+        if features.dense.dtype != torch.float32:
+            # Depth and normals are differences of large numbers: what follows the features stays in float32 under autocast.
+            with torch.autocast(images.device.type, enabled=False):
+                return self._from_features(features.float(), prepared, heads, generated)
+        return self._from_features(features, prepared, heads, generated)
+
+    def _from_features(
+        self,
+        features: Features,
+        prepared: PreparedViews,
+        heads: frozenset[Head],
+        generated: Bool[Tensor, "view"] | None,
+    ) -> Prediction:
         images, priors = prepared.images, prepared.priors
         views, _, height, width = images.shape
-        features = self.network.features(prepared.working)
         camera_vector, world_from_cam, intrinsics = self._cameras(
             features.camera_tokens, priors, prepared.scale, height, width
         )
@@ -140,6 +155,11 @@ class Mini(nn.Module):
             gaussian_depth=gaussian_depth,
             gaussians=gaussians,
         )
+
+    def save_memory(self, *, checkpoint_activations: bool, views_per_chunk: int) -> None:
+        """See `SavesMemory.save_memory`."""
+        self.network.checkpoint_activations = checkpoint_activations
+        set_views_per_chunk(self, views_per_chunk)
 
     @classmethod
     def from_weights(cls, weights: str | Path) -> Mini:

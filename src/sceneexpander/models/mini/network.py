@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sceneexpander.models.layers.block import run_checkpointed
 from sceneexpander.models.layers.camera_head import CameraHead
 from sceneexpander.models.layers.dpt import DptConfig, DptHead
 from sceneexpander.models.layers.rope import grid_rope
@@ -26,6 +27,10 @@ class Features:
 
     camera_tokens: Float[Tensor, "view dim"]
     dense: Float[Tensor, "view channel out_height out_width"]
+
+    def float(self) -> Features:
+        """The same in float32."""
+        return Features(camera_tokens=self.camera_tokens.float(), dense=self.dense.float())
 
 
 class Stem(nn.Module):
@@ -54,6 +59,7 @@ class MiniNetwork(nn.Module):
     def __init__(self, config: MiniConfig) -> None:
         super().__init__()
         self.config = config
+        self.checkpoint_activations = False
         half, quarter, eighth = config.stem_widths
         self.stem = Stem(config.stem_widths, config.width)
         self.camera_token = nn.Parameter(torch.randn(1, 2, 1, config.width) * 0.02)
@@ -96,7 +102,8 @@ class MiniNetwork(nn.Module):
     def features(self, inputs: WorkingViews) -> Features:
         """Run stem, trunk and decoder once for all heads."""
         config = self.config
-        token_map, half, quarter, eighth = self.stem(inputs)
+        checkpoint = self.checkpoint_activations
+        token_map, half, quarter, eighth = run_checkpointed(self.stem, inputs, enabled=checkpoint)
         views, _, rows, columns = token_map.shape
         specials = 1 + config.register_tokens
         tokens = torch.cat(
@@ -108,11 +115,17 @@ class MiniNetwork(nn.Module):
             dim=2,
         )
         rope = grid_rope(rows, columns, specials=specials, head_dim=self.trunk.head_dim, base=ROPE_BASE, like=token_map)
-        collected = self.trunk.alternate(tokens, rope)
+        collected = self.trunk.alternate(tokens, rope, checkpoint=checkpoint)
         levels = [level[0] for level in collected]
-        size = (rows * PATCH_PX // 2, columns * PATCH_PX // 2)
+        grid, size = (rows, columns), (rows * PATCH_PX // 2, columns * PATCH_PX // 2)
         skips = [self.skip_quarter(quarter), self.skip_eighth(eighth), None, None]
-        dense = self.decoder.features(levels, specials, (rows, columns), size, skips)
+        parts = []
+        for chunk in self.decoder.chunks(views):
+            chosen = [level[chunk] for level in levels], [None if skip is None else skip[chunk] for skip in skips]
+            parts.append(
+                run_checkpointed(self.decoder.features, chosen[0], specials, grid, size, chosen[1], enabled=checkpoint)
+            )
+        dense = parts[0] if len(parts) == 1 else torch.cat(parts)
         return Features(camera_tokens=levels[-1][:, 0], dense=dense + self.skip_half(half))
 
 

@@ -54,6 +54,11 @@ class WorldMirrorConfig(BackboneConfig):
         return cls()
 
     @classmethod
+    def mid(cls) -> WorldMirrorConfig:
+        """A sixth of the released size (198.6 M parameters), for timings on a CPU; nobody publishes weights for it."""
+        return cls(dim=384, encoder_depth=12, encoder_heads=6, trunk_depth=8, trunk_heads=6, collect=(1, 3, 5, 7))
+
+    @classmethod
     def tiny(cls) -> WorldMirrorConfig:
         """A complete but very small configuration (0.6 M parameters) for dry runs; nobody publishes weights for it."""
         sizes = cls.tiny_sizes()

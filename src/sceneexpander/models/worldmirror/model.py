@@ -124,7 +124,9 @@ class WorldMirror(BackboneModel):
             ValueError: for a size that is not a multiple of the patch side.
         """
         features = self.encode(images, self.normalise(priors, images))
-        return self.decode(features, images, heads=heads, generated=generated)
+        # As in the official code: under autocast the heads stay in float32. Their outputs are exponentials of what they compute.
+        with torch.autocast(images.device.type, enabled=False):
+            return self.decode(features, images, heads=heads, generated=generated)
 
     def normalise(
         self, priors: BatchPriors | None, images: Float[Tensor, "batch view 3 height width"]
