@@ -23,7 +23,7 @@ def main() -> None:
             conf=CONF,
             overrides=selection.overrides,
             rounds=selection.rounds,
-            rivals=[name for name in layout.RIVALS if name in methods],
+            methods=methods,
         )
 
 

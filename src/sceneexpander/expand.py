@@ -1,6 +1,7 @@
 """Your own photos, one command: ``python -m sceneexpander.expand PHOTOS --inserted PICTURE --prompt "..."``.
 
 ``PHOTOS`` is a folder of photos, or a scene folder with a ``scene.yaml``. Runs unattended in ``runs/NAME`` and prints where the report is.
+The methods are those that the project selects.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from sceneexpander.errors import UserError, entry_point
 from sceneexpander.ingest import list_pictures, make_round, read_picture, safe_name
 from sceneexpander.preflight import check_scene
 from sceneexpander.project import find_project
-from sceneexpander.workspace import Selection, make_workspace, merged_overrides, reproduce
+from sceneexpander.workspace import Selection, make_workspace, merged_overrides, read_selection, reproduce
 
 SCENE_FILE = "scene.yaml"
 
@@ -127,8 +128,9 @@ def expand(request: Request, *, project: Path) -> Path:
         scene = Path(scratch) / name
         stage_scene(request, name, scene)
         overrides = merged_overrides((), request.overrides)
-        rounds = check_scene(name, scene, conf=project / "conf", overrides=overrides)
-        selection = Selection(scenes=(name,), rounds=rounds, overrides=overrides)
+        methods = read_selection(project).methods
+        rounds = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=methods)
+        selection = Selection(scenes=(name,), rounds=rounds, methods=methods, overrides=overrides)
         make_workspace(folder, selection, project=project, scenes={name: scene})
     reproduce(folder, project=project)
     return folder / "outputs" / "report" / "index.html"

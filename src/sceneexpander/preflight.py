@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 
 from sceneexpander.config.compose import compose, scene_option
@@ -12,6 +13,7 @@ from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.expansion import ModelConfig, load_model
 from sceneexpander.generation import generate_inserted_view
+from sceneexpander.inference.rivals import RivalsConfig
 from sceneexpander.ingest import load_scene
 
 
@@ -22,7 +24,7 @@ def check_scene(
     conf: Path,
     overrides: Sequence[str],
     rounds: int | None = None,
-    rivals: Sequence[str] = (),
+    methods: Sequence[str] = (),
 ) -> int:
     """Compose the configuration for a scene and read all of its pictures; nothing is written.
 
@@ -32,7 +34,7 @@ def check_scene(
         conf: the configuration folder.
         overrides: Hydra overrides.
         rounds: how many rounds are to run; None: all that the scene defines.
-        rivals: reconstructors of others that are to run; those without weights will say so in their rows.
+        methods: that are to run; reconstructors of others among them that have no weights will say so in their rows.
 
     Returns:
         the number of rounds.
@@ -47,7 +49,7 @@ def check_scene(
     for number in range(1, count + 1):
         generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
     check_weights(config.model)
-    for rival in rivals:
+    for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
         section = config.rivals.of(rival)
         if section.weights is not None:
             check_weights(

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from sceneexpander.workspace import Selection, make_workspace, workspace_environment
@@ -304,3 +305,47 @@ def test_the_pinned_dvc_still_has_what_the_locks_are_named_by() -> None:
 
     assert callable(cache._can_hash)
     assert callable(cache._get_stage_hash)
+
+
+def test_rivals_are_rows_like_any_other_and_say_so_when_they_cannot_be(finished: Project, tmp_path: Path) -> None:
+    """Three more methods: one with weights (of no use), one without, and an optimisation; ours are not made again."""
+    import torch
+    from safetensors.torch import save_file
+
+    from sceneexpander.models.omnivggt import OmniVGGT, OmniVGGTConfig
+
+    model = OmniVGGT.create(OmniVGGTConfig.tiny(), generator=torch.Generator().manual_seed(0))
+    weights = tmp_path / "omnivggt.safetensors"
+    save_file({name: value.clone() for name, value in model.state_dict().items()}, weights)
+    settings = [
+        "rivals.omnivggt.variant=tiny",
+        f"rivals.omnivggt.weights={weights}",
+        "rivals.omnivggt.long_side_px=126",
+    ]
+    rows = ["gaussian_splatting", "omnivggt", "omnivggt_optimised", "ttt3r"]
+    params = finished.folder / "params.yaml"
+    before = params.read_text()
+    try:
+        changed = yaml.safe_load(before)
+        changed["methods"] += rows
+        changed["overrides"] += settings
+        params.write_text(yaml.safe_dump(changed))
+        executed = finished.repro()
+        again = finished.repro()
+        page = (finished.folder / "outputs" / "report" / "index.html").read_text()
+        table = (finished.folder / "outputs" / "report" / "comparison.md").read_text()
+        numbers = json.loads((finished.folder / "results" / "metrics.json").read_text())["room"]["round_1"]
+    finally:
+        params.write_text(before)
+        finished.repro()
+    remade = {name.partition("@")[0] for name in executed if not any(row in name for row in rows)}
+    assert remade == {"resolve", "collect", "report", "track"}, executed
+    assert again == []
+    assert numbers["ttt3r"] == {"unavailable": "needs the public checkpoint"}
+    for row in rows[:3]:
+        assert 3 < numbers[row]["psnr_db"] < 100
+        assert numbers[row]["inserted_psnr_db"] > 3
+    assert numbers["gaussian_splatting"]["gaussians"] <= 3000, "what it started from, thinned, and its growth"
+    assert "OmniVGGT, pixel-aligned" in page
+    assert "needs the public checkpoint" in page
+    assert len([line for line in table.splitlines() if line.startswith("| ")]) == 2 + 7
