@@ -10,12 +10,15 @@ from safetensors.torch import save_file
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.warmup import WarmupConfig, held_out_cells, warm_up
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
+from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.store import sha256_of_tensors
+from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.errors import UserError
 from sceneexpander.expansion import (
     LoadedModel,
     ModelConfig,
+    PriorsUse,
     RoundInputs,
     adapt_round,
     captured_prediction,
@@ -24,6 +27,8 @@ from sceneexpander.expansion import (
     load_model,
 )
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.geometry.priors import Priors
+from sceneexpander.models.omnivggt import OmniVGGT, OmniVGGTConfig
 from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
 from tests.support.tiny_model import TinyReconstructor, tiny_images
 from tests.unit.artifacts.test_artifacts import make_views
@@ -125,6 +130,42 @@ def test_worldmirror_runs_a_round_with_strictly_loaded_weights(tmp_path: Path) -
     assert untouched
     assert not set(untouched) & set(after.weights.change), "no loss reaches these heads"
     assert len(result.records) == CONFIG.steps
+
+
+def test_omnivggt_as_the_reconstructor_is_told_what_the_front_end_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``model.priors=front_end``, through a whole round with adaptation."""
+    model = OmniVGGT.create(OmniVGGTConfig.tiny(), generator=torch.Generator().manual_seed(0))
+    save_file({k: v.clone() for k, v in model.state_dict().items()}, tmp_path / "weights.safetensors")
+    asked: list[int] = []
+
+    def found(images: torch.Tensor, *_: object, **__: object) -> tuple[Priors, None]:
+        views, _, height, width = images.shape
+        asked.append(views)
+        poses = torch.eye(4).repeat(views, 1, 1)
+        poses[:, 0, 3] = 0.3 * torch.arange(views)
+        intrinsics = torch.tensor([[20.0, 0, width / 2], [0, 20.0, height / 2], [0, 0, 1]]).repeat(views, 1, 1)
+        depth = torch.full((views, height, width), 2.0)
+        return Priors(world_from_cam=poses, intrinsics_px=intrinsics, depth=depth), None
+
+    small = make_views
+
+    def views(count: int, *, generated: bool = False, start: int = 0) -> ViewSet:
+        images = tiny_images(count, 28, 42, seed=start + 1)
+        return replace(small(count, generated=generated, start=start), images=images, detail_images=images)
+
+    monkeypatch.setattr("sceneexpander.expansion.rounds.build_priors", found)
+    monkeypatch.setattr("tests.unit.expansion.test_rounds.make_views", views)
+    results = {}
+    for use in PriorsUse:
+        config = ModelConfig(name="omnivggt", variant="tiny", weights=str(tmp_path / "weights.safetensors"), priors=use)
+        _, backbone, expanded = _round(load_model(config), replace(CONFIG, steps=2))
+        assert isinstance(expanded, Reconstruction)
+        expanded.save(tmp_path / use.value)
+        results[use] = backbone
+    assert asked == [3, 4], "only when asked for: the captured views, then all"
+    assert not torch.equal(results[PriorsUse.AUTO].depth, results[PriorsUse.FRONT_END].depth)
 
 
 @pytest.mark.parametrize(
