@@ -78,6 +78,18 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(strategy: str) -
     assert not torch.equal(first.gaussians.means[:100], other.gaussians.means[:100])
 
 
+def test_the_number_of_threads_does_not_matter() -> None:
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            results.append(run(replace(SHORT, steps=4)))
+    finally:
+        torch.set_num_threads(threads)
+    assert_same(*results)
+
+
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_stopped_and_resumed_gives_the_bits_of_an_unbroken_run(strategy: str, tmp_path: Path) -> None:
     density = replace(SHORT.density, strategy=strategy)  # type: ignore[arg-type]
