@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import logging
 import os
 import shutil
 import uuid
@@ -26,6 +27,7 @@ from sceneexpander.errors import UserError
 
 FACTS_NAME = "artifact.json"
 TENSORS_NAME = "tensors.safetensors"
+_log = logging.getLogger(__name__)
 
 
 class ArtifactError(UserError):
@@ -137,6 +139,21 @@ def load_artifact(folder: Path, schema: str) -> tuple[dict[str, Any], dict[str, 
         raise ArtifactError(
             f"cannot be read ({error})", where=path, fix="delete the folder and rerun its stage"
         ) from None
+
+
+def load_resume_point(folder: Path, schema: str, run_key: str) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
+    """(facts, tensors) of an artefact whose fact ``run_key`` is the given one, or None; what else lies there is reported and ignored."""
+    if not folder.exists():
+        return None
+    try:
+        facts, tensors = load_artifact(folder, schema)
+    except ArtifactError as error:
+        _log.warning("ignoring a damaged checkpoint: %s", error.line())
+        return None
+    if facts["run_key"] != run_key:
+        _log.warning("ignoring a checkpoint of another run in %s", folder)
+        return None
+    return facts, tensors
 
 
 def require_tensor(tensors: Mapping[str, Tensor], name: str, folder: Path) -> Tensor:

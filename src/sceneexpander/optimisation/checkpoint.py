@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
 
-from sceneexpander.artifacts.store import ArtifactError, directory_being_written, load_artifact, save_artifact
+from sceneexpander.artifacts.store import directory_being_written, load_resume_point, save_artifact
 
 SCHEMA = "optimisation-checkpoint/1"
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,16 +35,10 @@ class OptimisationCheckpoint:
     @classmethod
     def load(cls, folder: Path, run_key: str) -> OptimisationCheckpoint | None:
         """The checkpoint of this very run, or None if there is none (damaged ones are reported and ignored)."""
-        if not folder.exists():
+        found = load_resume_point(folder, SCHEMA, run_key)
+        if found is None:
             return None
-        try:
-            facts, tensors = load_artifact(folder, SCHEMA)
-        except ArtifactError as error:
-            _log.warning("ignoring a damaged checkpoint: %s", error.line())
-            return None
-        if facts["run_key"] != run_key:
-            _log.warning("ignoring a checkpoint of another run in %s", folder)
-            return None
+        facts, tensors = found
         parts: dict[str, dict[str, Tensor]] = {"splats": {}, "density": {}, "cameras": {}}
         for key, value in tensors.items():
             part, _, name = key.partition("/")
