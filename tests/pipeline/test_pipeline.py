@@ -135,7 +135,7 @@ def test_a_comment_reruns_no_work_and_code_reruns_what_uses_it(finished: Project
         source.write_text(before + "\n# a comment\n")
         assert finished.repro() == ["code"]
         source.write_text(before + "\nUNUSED = 1\n")
-        assert finished.repro() == ["code", "report", "track"]
+        assert finished.repro() == ["code", "collect@room", "report", "track"]
     finally:
         source.write_text(before)
         finished.repro()
