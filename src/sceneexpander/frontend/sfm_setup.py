@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.errors import UserError
@@ -18,6 +19,7 @@ from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, FocalSource
 class Setup:
     """Inputs in the form the steps need."""
 
+    colours: Float[Tensor, "view 3 height width"]  # on the CPU
     greys: list[np.ndarray]
     names: tuple[str, ...]
     scale_xy: np.ndarray  # pixels of the given images per pixel of the feature images
@@ -65,6 +67,7 @@ def prepare(
     # Always one draw, so that the caller's stream does not depend on what was found.
     seed = int(torch.randint(0, 2**30, (1,), generator=generator).item())
     return Setup(
+        colours=source.detach().cpu(),
         greys=[grey_u8(image) for image in source.detach().cpu().numpy()],
         names=labels,
         scale_xy=np.array([images.shape[3] / width, images.shape[2] / height]),

@@ -13,6 +13,14 @@ from sceneexpander.frontend.sparse_points import SparsePoints
 REFERENCE_LONG_SIDE_PX = 768  # every `_px` threshold below is for images of this long side, and scales with it
 
 
+class LearnedUse(StrEnum):
+    """When learned keypoints and matches (`sceneexpander.frontend.learned`) join SIFT's."""
+
+    NEVER = "never"
+    RESCUE = "rescue"  # only if SIFT leaves a view out of the model, and kept only if that brings one in
+    ALWAYS = "always"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SfmConfig:
     """Constants of the sparse front-end. Thresholds in pixels hold at a long side of 768 px and scale with the images.
@@ -32,6 +40,12 @@ class SfmConfig:
     guided_band_px: float = 2.0
     guided_ratio: float = 0.85
     guided_max_distance: float = 0.7  # of unit descriptors
+
+    learned: LearnedUse = LearnedUse.RESCUE
+    learned_features: int = 2048  # per view
+    learned_long_side_px: int = 1024
+    learned_min_expected: float = 20.0  # matches that must be expected to be right, or two views share nothing
+    learned_neighbours: int = 4  # of each view that SIFT has connected: the others it is matched with
 
     # Verification of pairs.
     epipolar_px: float = 1.5  # MAGSAC noise scale for fundamental, essential and homography models

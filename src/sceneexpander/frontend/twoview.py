@@ -56,7 +56,14 @@ def usac_parameters(threshold: float, seed: int) -> cv2.UsacParams:
 
 
 def match_and_verify(
-    view_a: int, view_b: int, features: list[Features], config: SfmConfig, *, unit_px: float, seed: int
+    view_a: int,
+    view_b: int,
+    features: list[Features],
+    config: SfmConfig,
+    *,
+    unit_px: float,
+    seed: int,
+    learned: Matches | None = None,
 ) -> PairMatches:
     """Match two views and keep what one fundamental matrix explains.
 
@@ -67,13 +74,17 @@ def match_and_verify(
         config: ratios and thresholds.
         unit_px: pixels per pixel at the reference size (thresholds are multiplied by it).
         seed: of the robust fit.
+        learned: matches between the views' keypoints without descriptors, counted from the first of those; they are
+            verified together with the others.
     """
     a, b = features[view_a], features[view_b]
-    if min(a.count, b.count) < 2:
-        return PairMatches(view_a=view_a, view_b=view_b, loose=Matches.empty(), tentative=0, verified=Matches.empty())
-    scores = similarity(a, b)
-    loose = mutual_matches(scores, config.loose_match_ratio)
+    loose = Matches.empty()
+    if min(a.described, b.described) >= 2:
+        loose = mutual_matches(similarity(a, b), config.loose_match_ratio)
     strict = loose.select(loose.ratio <= config.match_ratio)
+    if learned is not None:
+        loose = loose.joined(learned, offset_a=a.described, offset_b=b.described)
+        strict = strict.joined(learned, offset_a=a.described, offset_b=b.described)
     verified = Matches.empty()
     fit = fit_fundamental(a.pixel_xy[strict.index_a], b.pixel_xy[strict.index_b], config, unit_px=unit_px, seed=seed)
     if fit is not None:
@@ -94,6 +105,8 @@ def match_guided(
 ) -> PairMatches:
     """The same pair with its verified matches found again inside the epipolar band of a known geometry.
 
+    Matches of keypoints without descriptors stay as they are.
+
     Args:
         pair: as matched before.
         features: of all views.
@@ -111,6 +124,7 @@ def match_guided(
         max_ratio=config.guided_ratio,
         max_distance=config.guided_max_distance,
     )
+    found = found.joined(pair.verified.select(pair.verified.index_a >= a.described))
     distinct = distinct_positions(a.pixel_xy[found.index_a], b.pixel_xy[found.index_b])
     return replace(pair, verified=found.select(distinct))
 

@@ -18,7 +18,7 @@ from sceneexpander.geometry.camera import project_points
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 290.0
-FAST = SfmConfig(max_features=1000)
+FAST = SfmConfig(max_features=1000, learned_features=512, learned_long_side_px=640)
 
 
 def generator(seed: int = 0) -> torch.Generator:
