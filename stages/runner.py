@@ -93,8 +93,13 @@ def _parse(name: str, axes: tuple[str, ...]) -> Cell:
     return Cell(**values)
 
 
+# `resolve` is over before it could be measured; `collect` depends on the folder that statistics are in, and a stage that changes its
+# own dependency is never restored from the cache.
+_UNMEASURED = frozenset({"resolve", "collect"})
+
+
 def _statistics_path(name: str, axes: tuple[str, ...], cell: Cell) -> Path | None:
-    if not axes or name == "resolve":
+    if not axes or name in _UNMEASURED:
         return None
     return layout.statistics(name, cell.scene, cell.round if "round" in axes else None, cell.method or None)
 
