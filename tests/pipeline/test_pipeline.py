@@ -299,7 +299,13 @@ def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_pa
     for path in (folder / "outputs" / "room").rglob("stats/*.json"):
         if json.loads(path.read_text())["started"] >= started:
             fresh.add(path.stem)
-    assert fresh == {"adapt", "render-sceneexpander", "pack-sceneexpander", "evaluate-sceneexpander"}
+    made_from_it = {
+        "optimise-sceneexpander_optimised",
+        "render-sceneexpander",
+        "pack-sceneexpander",
+        "evaluate-sceneexpander",
+    }
+    assert fresh == {"adapt"} | made_from_it
 
 
 def test_the_pinned_dvc_still_has_what_the_locks_are_named_by() -> None:
