@@ -30,6 +30,10 @@ class Similarity:
         rotation = self.rotation @ source_from_cam[..., :3, :3]
         return rigid_from_parts(rotation, self.points(source_from_cam[..., :3, 3]))
 
+    def enlarged(self, factor: float) -> Similarity:
+        """The same, followed by multiplying the target frame by ``factor``."""
+        return Similarity(scale=self.scale * factor, rotation=self.rotation, translation=self.translation * factor)
+
     def inverse(self) -> Similarity:
         """The map from target to source."""
         rotation = self.rotation.T

@@ -18,7 +18,7 @@ from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.viewer.cameras import Cameras, alignment, frustum_length, up_direction
 from sceneexpander.viewer.packed import visible_weight
-from sceneexpander.viewer.viser_axes import viser_camera, viser_picture, viser_splats
+from sceneexpander.viewer.viser_axes import enlargement, viser_camera, viser_picture, viser_splats, widened
 
 HOST = "127.0.0.1"  # never another: the server has no accounts
 CAPTURED_COLOUR = (98, 188, 195)
@@ -34,22 +34,23 @@ class LiveMethod:
 
     name: str
     gaussians: Gaussians
-    cameras: Cameras  # in the common frame
-    main_from_method: Similarity
+    cameras: Cameras  # in the frame that is shown: the common one, enlarged
+    shown_from_method: Similarity
 
     @classmethod
-    def of(cls, reconstruction: Reconstruction, main: Cameras, *, limit: int) -> LiveMethod:
-        """Order and align. The weights are only computed where something must be left out."""
+    def of(cls, reconstruction: Reconstruction, main: Cameras, *, factor: float, limit: int) -> LiveMethod:
+        """Order, align, enlarge by ``factor``. The weights are only computed where something must be left out."""
         gaussians, cameras = reconstruction.gaussians, Cameras.of(reconstruction)
         if len(gaussians) > limit:
             weight = visible_weight(reconstruction)
             gaussians = gaussians.select(torch.argsort(weight, descending=True, stable=True)[:limit])
-        transform = alignment(cameras, main)
+        gaussians = widened(gaussians, cameras)
+        transform = alignment(cameras, main).enlarged(factor)
         return cls(
             name=reconstruction.method,
             gaussians=gaussians,
             cameras=cameras.transformed(transform),
-            main_from_method=transform,
+            shown_from_method=transform,
         )
 
 
@@ -96,9 +97,12 @@ class LiveViewer:
             import viser
         except ImportError:
             raise UserError("viser is not installed", where="viewer", fix="pip install -e .[viewer]") from None
-        main = Cameras.of(reconstructions[-1])
-        self._methods = {item.method: LiveMethod.of(item, main, limit=limit) for item in reconstructions}
+        common, factor = Cameras.of(reconstructions[-1]), enlargement(reconstructions[-1].gaussians)
+        self._methods = {
+            item.method: LiveMethod.of(item, common, factor=factor, limit=limit) for item in reconstructions
+        }
         names = list(self._methods)
+        main = self._methods[names[-1]].cameras
         self._shown = _Shown(
             method=names[-1], before=names[-2] if len(names) > 1 else None, eye=viser_camera(main, 0).position
         )
@@ -156,7 +160,7 @@ class LiveViewer:
 
     def _add_method(self, method: LiveMethod, pictures: Mapping[str, Tensor]) -> None:
         scene, cameras = self._server.scene, method.cameras
-        splats = viser_splats(method.gaussians, method.main_from_method)
+        splats = viser_splats(method.gaussians, method.shown_from_method)
         self._shown.splats[method.name] = scene.add_gaussian_splats(
             f"/{method.name}/splats", splats.centers, splats.covariances, splats.rgbs, splats.opacities, visible=False
         )
@@ -230,7 +234,8 @@ class LiveViewer:
         method = self._methods[shown.method]
         total = self._totals[shown.method]
         self._note.content = (
-            f"{len(method.gaussians):,} of {total:,} Gaussians, the most visible ones; colours do not change with direction.\n\n"
+            f"{len(method.gaussians):,} of {total:,} Gaussians, the most visible ones; colours do not change with direction. "
+            "Not drawn: what is narrower than about half a pixel of this window.\n\n"
             "Frames: photos blue-green, the generated picture orange. Click one to stand there."
         )
 
@@ -253,5 +258,5 @@ class LiveViewer:
         shown = self._shown
         for name, handle in shown.splats.items():
             method = self._methods[name]
-            splats = viser_splats(method.gaussians, method.main_from_method, tint=shown.tint, opacity=shown.opacity)
+            splats = viser_splats(method.gaussians, method.shown_from_method, tint=shown.tint, opacity=shown.opacity)
             handle.rgbs, handle.opacities = splats.rgbs, splats.opacities

@@ -8,7 +8,7 @@ covariances.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
-from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rigid_inverse, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting.video import GENERATED_TINT
 from sceneexpander.viewer.cameras import Cameras
 
+LEAST_STD_PX = 0.8
+TYPICAL_STD = 0.05  # its square is far from both ends of 16-bit floats, 6e-8 and 65504
 TINT_STRENGTH = 0.45
 
 
@@ -45,6 +47,31 @@ class ViserSplats:
     covariances: NDArray[np.float32]
     rgbs: NDArray[np.float32]
     opacities: NDArray[np.float32]
+
+
+def enlargement(gaussians: Gaussians) -> float:
+    """By how much to enlarge a scene for viser, which sends covariances as 16-bit floats: those of small scenes would become zero.
+
+    Typical Gaussians get a standard deviation of `TYPICAL_STD`, ten times thinner and a thousand times larger ones still fit.
+    """
+    if not len(gaussians):
+        return 1.0
+    return TYPICAL_STD / max(float(gaussians.scales.median()), torch.finfo(torch.float32).tiny)
+
+
+def widened(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
+    """Gaussians wide enough for viser to draw them where a window has about the resolution of the views.
+
+    It leaves out those of which opacity times the determinant of the 2-D covariance (blurred by 0.3) is below a quarter of a pixel^4; a
+    pixel of a view with a standard deviation of 0.4 is among them. The two wider axes therefore get at least `LEAST_STD_PX` pixels of
+    the view that made the Gaussian; the thin one stays.
+    """
+    source = gaussians.source_view.clamp(0, len(cameras.view_ids) - 1)
+    cam_from_world = rigid_inverse(cameras.world_from_cam)[source]
+    depth = (cam_from_world[:, 2, :3] * gaussians.means).sum(-1) + cam_from_world[:, 2, 3]
+    least = LEAST_STD_PX * depth.clamp(min=0) / cameras.intrinsics_px[source, 0, 0]
+    thin = torch.nn.functional.one_hot(gaussians.scales.argmin(-1), 3).bool()
+    return replace(gaussians, scales=torch.where(thin, gaussians.scales, gaussians.scales.maximum(least[:, None])))
 
 
 def viser_camera(cameras: Cameras, view: int) -> ViserCamera:

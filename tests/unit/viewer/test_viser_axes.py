@@ -14,7 +14,15 @@ from sceneexpander.geometry.rigid import look_at, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting.video import GENERATED_TINT
 from sceneexpander.viewer.cameras import Cameras
-from sceneexpander.viewer.viser_axes import TINT_STRENGTH, viser_camera, viser_picture, viser_splats
+from sceneexpander.viewer.viser_axes import (
+    LEAST_STD_PX,
+    TINT_STRENGTH,
+    enlargement,
+    viser_camera,
+    viser_picture,
+    viser_splats,
+    widened,
+)
 from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
 
 STAY = Similarity(scale=1.0, rotation=torch.eye(3), translation=torch.zeros(3))
@@ -62,6 +70,36 @@ def test_tint_and_opacity() -> None:
     expected = (1 - TINT_STRENGTH) * colours[1] + TINT_STRENGTH * torch.tensor(GENERATED_TINT)
     np.testing.assert_allclose(splats.rgbs, torch.stack([colours[0], expected]).numpy(), atol=1e-6)
     np.testing.assert_allclose(splats.opacities[:, 0], 0.5 * gaussians.opacities.numpy(), atol=1e-6)
+
+
+def test_small_scenes_keep_their_shapes_as_16_bit_floats() -> None:
+    gaussians = reconstruction("captured", [0.0], scale=0.01).gaussians.select(torch.arange(50))
+    gaussians = replace(gaussians, scales=gaussians.scales * torch.tensor([1.0, 0.7, 0.2]))
+    factor = enlargement(gaussians)
+    assert float(gaussians.scales.median()) * factor == pytest.approx(0.05)
+    sent = viser_splats(gaussians, STAY.enlarged(factor)).covariances
+    diagonal = sent[:, [0, 1, 2], [0, 1, 2]]
+    np.testing.assert_allclose(diagonal.astype(np.float16), diagonal, rtol=2e-3)
+    plain = viser_splats(gaussians, STAY).covariances[:, [0, 1, 2], [0, 1, 2]]
+    assert np.abs(plain.astype(np.float16) / plain - 1).max() > 0.02, "what it is for"
+    assert enlargement(gaussians.select(torch.arange(0))) == 1.0
+
+
+def test_enlarging_a_similarity_enlarges_its_target() -> None:
+    turn = rotation_from_quat_wxyz(torch.tensor([0.5, 0.5, 0.1, -0.7]))
+    move = Similarity(scale=2.0, rotation=turn, translation=torch.tensor([1.0, 2.0, 3.0]))
+    points = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(move.enlarged(3.0).points(points), 3 * move.points(points))
+
+
+def test_narrow_gaussians_are_widened_in_the_view_that_made_them() -> None:
+    scene = reconstruction("captured", [0.0, 0.4])
+    flat = torch.tensor([[0.01, 0.001, 0.3], [0.5, 0.4, 0.002]])
+    gaussians = replace(scene.gaussians.select(torch.arange(2)), scales=flat)
+    found = widened(gaussians, Cameras.of(scene)).scales
+    least = LEAST_STD_PX * 2.0 / 25.0  # depth 2, focal length 25
+    expected = torch.tensor([[least, 0.001, 0.3], [0.5, 0.4, 0.002]])
+    torch.testing.assert_close(found, expected)
 
 
 def test_pictures_become_bytes_with_channels_last() -> None:
