@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict, dataclass
 
 from sceneexpander.adaptation.config import AdaptConfig
@@ -11,10 +12,12 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.state import ExpansionState, load_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, load_model
+from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, judge_round, load_model
 from sceneexpander.progress import progress_bar
 from stages import layout
 from stages.runner import Cell, checkpoint_folder, remove_folder, run_identity, stage, use_threads
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +48,11 @@ def main(cell: Cell) -> None:
         anchors=Anchors.load(sources[2]),
         joint_priors=load_priors(sources[3]),
     )
+    verdict = judge_round(inputs)
+    if verdict is not None and not verdict.accepted:
+        _log.warning(
+            "%s round %d: the inserted view fits badly: %s", cell.scene, cell.round, "; ".join(verdict.reasons)
+        )
     checkpoints = checkpoint_folder(run_identity(sections, sources))
     loaded = load_model(sections.model, sections.device)
     with progress_bar(f"adapt {cell.scene} round {cell.round}", sections.adapt.steps) as bar:
@@ -58,6 +66,8 @@ def main(cell: Cell) -> None:
     with directory_being_written(layout.state(cell.scene, cell.round)) as folder:
         state.save(folder)
         reconstruction.save(folder / "reconstruction")
+        if verdict is not None:
+            write_json_atomic(folder / "acceptance.json", verdict)
         write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])
     remove_folder(checkpoints)
 

@@ -29,8 +29,9 @@ from sceneexpander.fingerprint import SourceTree
 from sceneexpander.project import find_project
 
 TABLE = ("anchor", "subset_aug", "self_distill", "self_distill_p1", "full")  # the paper's, after the baseline
-CONTROLS = ("control_no_insertion", "control_no_anchor")
-GRADES_BY_DEFAULT = ("mixed_1", "mixed_2", "told_rotation_5")
+BEYOND = ("no_realign", "no_trust", "none", "splat")  # "none": nothing left out of the default
+CONTROLS = ("control_no_adaptation", "control_no_insertion", "control_no_anchor")
+GRADES_BY_DEFAULT = ("mixed_2",)
 SCHEMA = "ablation/1"
 
 
@@ -41,7 +42,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     for name, known, default in (
         ("scenes", SCENES, tuple(SCENES)),
         ("grades", GRADES, GRADES_BY_DEFAULT),
-        ("rows", (), (*TABLE, *CONTROLS)),
+        ("rows", (), (*TABLE, *BEYOND, *CONTROLS)),
         ("seeds", (), ("0", "1", "2")),
     ):
         shown = f" of {', '.join(known)}" if known else ""
@@ -52,6 +53,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--any-code", action="store_true", help="also use results that another version of the code made"
     )
+    parser.add_argument("--finished", action="store_true", help="run nothing: tables of the cells that are there")
     parser.add_argument("--out", type=Path, help="without suffix; default: results/ablation in the project")
     return parser.parse_args(given)
 
@@ -107,6 +109,7 @@ def main() -> None:
         cache=project / ".cache" / "expandbench",
         code=code_of(project),
         any_code=options.any_code,
+        finished_only=options.finished,
     )
     done = 0
 

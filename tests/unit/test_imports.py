@@ -24,7 +24,7 @@ ROOMS: dict[str, set[str]] = {
     "optimisation": {"artifacts", "evaluation", "geometry", "splatting"},
     "inference": {"artifacts", "geometry", "models"},
     "planning": {"adaptation", "geometry", "models"},
-    "expansion": {"adaptation", "artifacts", "frontend", "geometry", "inference", "models"},
+    "expansion": {"adaptation", "artifacts", "frontend", "geometry", "inference", "models", "splatting"},
     "evaluation": {"artifacts", "geometry", "splatting"},
     "expandbench": {
         "adaptation",

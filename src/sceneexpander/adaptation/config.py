@@ -47,11 +47,13 @@ class InsertedWeights(StrEnum):
 
 class Realign(StrEnum):
     """What happens to the front-end's estimate before the adaptation: nothing; captured views keep what was known of them before
-    the insertion and the inserted one follows; or the inserted camera is also refined against the captured scene."""
+    the insertion and the inserted one follows; the inserted camera is also refined against the captured scene; or whichever of
+    the first two shows the captured photos better."""
 
     NONE = "none"
     HOLD = "hold"
     REFINE = "refine"
+    CHOOSE = "choose"
 
 
 class Precision(StrEnum):
@@ -137,12 +139,10 @@ class AdaptConfig:
     drift: DriftForm = DriftForm.SUM
     gauge: Gauge = Gauge.KEEP_FIRST
     subset: SubsetRule = SubsetRule.PAPER
-    # Beyond the paper: see the modules photometric, consistency and realign.
-    lambda_splat: float = (
-        0.0  # weight of the captured photos against what the Gaussians of all views show there; 0: off
-    )
-    splat_every: int = 2  # steps between two such comparisons
-    splat_others: float = 0.5  # weight of the same without the view's own Gaussians
+    # Beyond the paper: see the modules gaussian_head, consistency and realign.
+    splat_steps: int = 0  # steps of the Gaussian head alone on the captured photos, after Algorithm 1; 0: none
+    splat_learning_rate: float = 3e-3
+    splat_others: float = 0.5  # weight of the same photos without the view's own Gaussians
     inserted_weights: InsertedWeights = InsertedWeights.UNIFORM
     realign: Realign = Realign.NONE
     trust: bool = False  # generated Gaussians fade where captured views contradict them, see `consistency.trusted`
@@ -163,8 +163,8 @@ class AdaptConfig:
             (self.restore_interval >= 0, f"restore_interval must be >= 0, is {self.restore_interval}"),
             (self.observe_every >= 0, f"observe_every must be >= 0, is {self.observe_every}"),
             (self.camera_huber > 0, f"camera_huber must be > 0, is {self.camera_huber}"),
-            (self.lambda_splat >= 0, f"lambda_splat must be >= 0, is {self.lambda_splat}"),
-            (self.splat_every >= 1, f"splat_every must be >= 1, is {self.splat_every}"),
+            (self.splat_steps >= 0, f"splat_steps must be >= 0, is {self.splat_steps}"),
+            (self.splat_learning_rate > 0, f"splat_learning_rate must be > 0, is {self.splat_learning_rate}"),
             (self.splat_others >= 0, f"splat_others must be >= 0, is {self.splat_others}"),
         ]
         for fine, message in problems:

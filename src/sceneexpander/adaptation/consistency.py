@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import unproject_to_world
-from sceneexpander.geometry.gaussians import SH_DC
+from sceneexpander.geometry.gaussians import SH_DC, Gaussians
 from sceneexpander.geometry.rigid import rigid_inverse, transform_points
 from sceneexpander.models.protocol import Prediction
 from sceneexpander.splatting import render
@@ -89,45 +89,56 @@ def inserted_weights(
 
 
 def trusted(reconstruction: Reconstruction, images: Float[Tensor, "view 3 height width"]) -> Reconstruction:
-    """The same reconstruction with generated Gaussians as opaque as the captured views let them be.
-
-    The opacity of every Gaussian of a generated view is multiplied by how well its place and its colour agree with the captured views
-    that see it: what stands in space that a photo looks through fades, and so does what is painted onto a surface that a photo shows
-    in another colour. What no captured view sees stays as it is. It also fades a requested object that stands where the photos show
-    it is not.
-
-    Args:
-        reconstruction: of captured and generated views.
-        images: the pictures of its views, in its order.
-    """
-    gaussians = reconstruction.gaussians
-    captured = ~reconstruction.generated
-    made = gaussians.generated
-    if not bool(made.any()) or not bool(captured.any()):
+    """The same reconstruction with generated Gaussians as opaque as the captured views let them be, see `trust_factors`."""
+    gaussians, generated = reconstruction.gaussians, reconstruction.generated
+    cameras = reconstruction.world_from_cam, reconstruction.intrinsics_px
+    factors = trust_factors(gaussians, reconstruction.depth, *cameras, generated, images)
+    if factors is None:
         return reconstruction
-    points = gaussians.means[made]
-    cameras = reconstruction.world_from_cam[captured], reconstruction.intrinsics_px[captured]
-    found = agreement(points, reconstruction.depth[captured], *cameras)
-    colours = gaussians.sh[made, 0] * SH_DC + 0.5
-    off = colour_difference(points, colours, images[captured], reconstruction.depth[captured], *cameras)
-    agrees = found.weight * torch.where(found.seen, torch.exp(-((off / SAME_COLOUR) ** 2) / 2), 1.0)
-    filled = _filled_by_captured(reconstruction)
-    opacities = gaussians.opacities.clone()
-    opacities[made] *= 1 - filled * (1 - agrees)
-    return replace(reconstruction, gaussians=replace(gaussians, opacities=opacities))
+    return replace(reconstruction, gaussians=replace(gaussians, opacities=gaussians.opacities * factors))
 
 
 @torch.no_grad()
-def _filled_by_captured(reconstruction: Reconstruction) -> Float[Tensor, "made"]:
+def trust_factors(
+    gaussians: Gaussians,
+    depth: Float[Tensor, "view height width"],
+    world_from_cam: Float[Tensor, "view 4 4"],
+    intrinsics_px: Float[Tensor, "view 3 3"],
+    generated: Bool[Tensor, "view"],
+    images: Float[Tensor, "view 3 height width"],
+) -> Float[Tensor, "gaussian"] | None:
+    """What to multiply opacities by: 1 for captured Gaussians; None if there is nothing to compare.
+
+    A Gaussian of a generated view is left as much of its opacity as its place and its colour agree with the captured views that
+    see it: what stands in space that a photo looks through fades, and so does what is painted onto a surface that a photo shows
+    in another colour. What no captured view sees stays as it is, and so does what fills a gap between the captured views' own
+    Gaussians. It also fades a requested object that stands where the photos show it is not.
+    """
+    captured, made = ~generated, gaussians.generated
+    if not bool(made.any()) or not bool(captured.any()):
+        return None
+    points = gaussians.means[made]
+    cameras = world_from_cam[captured], intrinsics_px[captured]
+    found = agreement(points, depth[captured], *cameras)
+    colours = gaussians.sh[made, 0] * SH_DC + 0.5
+    off = colour_difference(points, colours, images[captured], depth[captured], *cameras)
+    agrees = found.weight * torch.where(found.seen, torch.exp(-((off / SAME_COLOUR) ** 2) / 2), 1.0)
+    filled = _filled_by_captured(gaussians, world_from_cam, intrinsics_px, generated, *depth.shape[1:])
+    factors = torch.ones_like(gaussians.opacities)
+    factors[made] = 1 - filled * (1 - agrees)
+    return factors
+
+
+def _filled_by_captured(
+    gaussians: Gaussians, world_from_cam: Tensor, intrinsics_px: Tensor, generated: Tensor, height: int, width: int
+) -> Float[Tensor, "made"]:
     """For every generated Gaussian: how far captured Gaussians alone fill its pixel, seen from the view that made it."""
-    gaussians = reconstruction.gaussians
-    height, width = reconstruction.depth.shape[1:]
     taken = gaussians.select(~gaussians.generated)
     sources = gaussians.source_view[gaussians.generated]
     points = gaussians.means[gaussians.generated]
     filled = torch.zeros_like(points[:, 0])
-    for view in torch.nonzero(reconstruction.generated)[:, 0].tolist():
-        camera = reconstruction.world_from_cam[view][None], reconstruction.intrinsics_px[view][None]
+    for view in torch.nonzero(generated)[:, 0].tolist():
+        camera = world_from_cam[view][None], intrinsics_px[view][None]
         alpha = render(taken, *camera, height, width).alpha
         own = sources == view
         there, _, in_frame = _seen_at(points[own], alpha[:, None], *camera, "bilinear")

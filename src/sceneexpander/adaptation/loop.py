@@ -13,13 +13,11 @@ from torch import Tensor
 
 from sceneexpander.adaptation.checkpoint import Checkpoint
 from sceneexpander.adaptation.config import AdaptConfig, DriftForm
-from sceneexpander.adaptation.engine import autocast
 from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, run_key
 from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import NonFiniteLoss
 from sceneexpander.adaptation.observe import Look, Observer, warnings_of
-from sceneexpander.adaptation.photometric import learn_from_photo
 from sceneexpander.adaptation.sampling import sample_batch
 from sceneexpander.models.protocol import Reconstructor, as_module
 
@@ -42,7 +40,6 @@ class StepRecord:
     gen_camera: float
     gen_depth: float
     gen_normal: float
-    splat: float  # colour error of the rendered captured view, 0 in steps that render none; see `photometric`
     drift: float  # L_reg before lambda_reg
     gradient_norm: float
     restored: int
@@ -159,12 +156,6 @@ class Run:
         values = losses.values(step)
         losses.objective.backward()  # type: ignore[no-untyped-call]
         del losses  # and the activations with them
-        splat = 0.0
-        if config.lambda_splat > 0 and step % config.splat_every == 0:
-            with autocast(config, self.learner.device):
-                splat = learn_from_photo(
-                    self.learner.model, self.inputs, config, inserted=batch.inserted, seed=self.seed, step=step
-                )
         done = ledger.update(step)
         if not math.isfinite(done.gradient):
             raise NonFiniteLoss(f"the gradient is not finite at step {step}")
@@ -173,8 +164,7 @@ class Run:
             step=step,
             captured=len(batch.captured),
             inserted=batch.inserted,
-            loss=values.pop("objective") + config.lambda_splat * splat + config.lambda_reg * drift,
-            splat=splat,
+            loss=values.pop("objective") + config.lambda_reg * drift,
             drift=drift,
             gradient_norm=done.gradient,
             restored=done.restored,

@@ -64,7 +64,7 @@ def realign(
         joint: priors of the captured views, then the inserted one.
         anchors: the captured views' anchored depth and cameras.
         images, inserted: the pictures.
-        mode: how much to do; `Realign.NONE` returns ``joint`` itself.
+        mode: how much to do; `Realign.NONE` returns ``joint`` itself. (`Realign.CHOOSE` needs a model: see the caller.)
         generator: which points are used.
     """
     if mode is Realign.NONE or captured.world_from_cam is None:

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan
-from sceneexpander.expandbench.table import COLUMNS, alone_table, curve_table, main_table, paired_table
+from sceneexpander.expandbench.table import (
+    COLUMNS,
+    acceptance_table,
+    alone_table,
+    curve_table,
+    main_table,
+    paired_table,
+)
 
 
 def report(cells: Sequence[CellResult], plan: Plan, *, model: str) -> str:
@@ -26,5 +33,6 @@ def report(cells: Sequence[CellResult], plan: Plan, *, model: str) -> str:
         "row gains here is not repair of an insertion.\n\n" + alone_table(cells),
         "## Against misalignment\n\n" + curve_table(cells, list(plan.rows)),
         curve_table(cells, list(plan.rows), next(column for column in COLUMNS if column.name == "new_psnr_db")),
+        "## Judging candidates before inserting them\n\n" + acceptance_table(cells),
     ]
     return "\n\n".join(part.rstrip() for part in parts) + "\n"

@@ -8,23 +8,26 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
 import torch
 
+from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.state import WeightsChange
 from sceneexpander.artifacts.store import read_json, to_plain, write_json_atomic
 from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.measure import BenchNumbers, measure
 from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.scenes import BenchScene, build_scene
-from sceneexpander.expansion import LoadedModel, ModelConfig, adapt_round, load_model
-from sceneexpander.expansion.rounds import reconstruct
+from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model
+from sceneexpander.expansion.rounds import adapted_weights, finished_round, realigned_priors, reconstruct
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.geometry.priors import Priors
 
 CAPTURED = "captured"  # the pre-insertion scene: the ceiling of preservation
 BASELINE = "baseline"  # the same weights given the inserted view
@@ -42,6 +45,7 @@ class Settings:
     code: str = ""
     any_code: bool = False
     threads: int = 1
+    finished_only: bool = False  # nothing is run: cells that are not there are left out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +66,7 @@ class Plan:
 class CellResult:
     """One reconstruction's numbers. ``alone``: the same weights given the captured views only (None for the two fixed rows).
 
-    ``grade`` is empty for `CAPTURED`, which no grade changes.
+    ``grade`` is empty for `CAPTURED`, which no grade changes. ``candidate`` is the judgement of the inserted view, in `BASELINE` cells.
     """
 
     scene: str
@@ -74,6 +78,7 @@ class CellResult:
     code: str
     numbers: BenchNumbers
     alone: BenchNumbers | None = None
+    candidate: Acceptance | None = None
 
     @classmethod
     def from_plain(cls, item: dict[str, object]) -> CellResult:
@@ -83,6 +88,9 @@ class CellResult:
             content = values[name]
             if isinstance(content, dict):
                 values[name] = BenchNumbers(**content)
+        candidate = values.get("candidate")
+        if isinstance(candidate, dict):
+            values["candidate"] = Acceptance(**{**candidate, "reasons": tuple(candidate["reasons"])})
         return cls(**values)  # type: ignore[arg-type]
 
 
@@ -130,9 +138,10 @@ class _Worker:
         self._loaded: LoadedModel | None = None
         self._prepared: PreparedScene | None = None
         self._cases: dict[str, PreparedCase] = {}
+        self._last: tuple[tuple[str, AdaptConfig, int], tuple[Priors, WeightsChange, float]] | None = None
 
-    def cell(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult:
-        """The cell's result, kept or new."""
+    def cell(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult | None:
+        """The cell's result, kept or new; None if it is not there and nothing is to be run."""
         identity = {"shared": self.shared, "scene": self.name, "grade": grade, "row": to_plain(config), "seed": seed}
         if config is None:
             identity["row"] = row
@@ -142,6 +151,8 @@ class _Worker:
             known = CellResult.from_plain(read_json(path) | {"row": row})
             if self.settings.any_code or known.code == self.settings.code:
                 return known
+        if self.settings.finished_only:
+            return None
         result = self._measured(grade, row, seed, config)
         write_json_atomic(path, result)
         return result
@@ -157,9 +168,10 @@ class _Worker:
             case = self.case(grade)
             reconstruction = case.backbone
         if config is not None and case is not None:
+            priors, weights, seconds = self._adapted(grade, case, config, seed)
             started = time.perf_counter()
-            state, reconstruction, adapted = adapt_round(case.inputs, self.loaded, config, seed=seed)
-            seconds, steps = time.perf_counter() - started, len(adapted.records)
+            state, reconstruction = finished_round(case.inputs, priors, weights, self.loaded, config, seed=seed)
+            seconds, steps = seconds + time.perf_counter() - started, config.steps
             before = case.inputs.state
             without = reconstruct(before.views, before.priors, self.loaded, state.weights, method="alone")
             alone = self._numbers(without, None)
@@ -173,7 +185,21 @@ class _Worker:
             code=self.settings.code,
             numbers=self._numbers(reconstruction, case),
             alone=alone,
+            candidate=judge_round(case.inputs) if case is not None and row == BASELINE else None,
         )
+
+    def _adapted(
+        self, grade: str, case: PreparedCase, config: AdaptConfig, seed: int
+    ) -> tuple[Priors, WeightsChange, float]:
+        """(priors, weights, seconds) of Algorithm 1 alone, so that rows that differ in what follows it share it. The last one is kept."""
+        shared = replace(config, trust=False, splat_steps=0)
+        key = grade, shared, seed
+        if self._last is None or self._last[0] != key:
+            started = time.perf_counter()
+            priors = realigned_priors(case.inputs, self.loaded, config.realign, seed=seed)
+            weights, _ = adapted_weights(case.inputs, priors, self.loaded, config, seed=seed)
+            self._last = key, (priors, weights, time.perf_counter() - started)
+        return self._last[1]
 
     def _numbers(self, reconstruction: Reconstruction, case: PreparedCase | None) -> BenchNumbers:
         views, truth = self.scene.captured, self.scene.truth
@@ -215,9 +241,11 @@ class _Worker:
 
 def _scene_cells(name: str, plan: Plan, settings: Settings) -> Iterator[CellResult]:
     worker = _Worker(name, settings)
-    yield worker.cell("", CAPTURED, 0, None)
+    wanted: list[tuple[str, str, int, AdaptConfig | None]] = [("", CAPTURED, 0, None)]
     for grade in plan.grades:
-        yield worker.cell(grade, BASELINE, 0, None)
-        for row, config in plan.rows.items():
-            for seed in plan.seeds:
-                yield worker.cell(grade, row, seed, config)
+        wanted.append((grade, BASELINE, 0, None))
+        wanted += [(grade, row, seed, config) for row, config in plan.rows.items() for seed in plan.seeds]
+    for cell in wanted:
+        result = worker.cell(*cell)
+        if result is not None:
+            yield result

@@ -176,6 +176,45 @@ def curve_table(cells: Sequence[CellResult], rows: Sequence[str], column: Column
     return _markdown(["grade", f"insertion's effect on {column.title}", *(f"{row} − baseline" for row in rows)], lines)
 
 
+HARM_DB = 0.5  # loss of captured PSNR by the insertion from which on a candidate should have been refused
+
+
+def acceptance_table(cells: Sequence[CellResult]) -> str:
+    """How well each measure of a candidate tells harmful insertions from others, and what the decision would have done.
+
+    "Tells apart" is the probability that a harmful candidate has the larger value (the smaller for the overlap): 0.5 is chance.
+    """
+    ceiling = {cell.scene: cell.numbers.psnr_db for cell in cells if cell.row == CAPTURED}
+    judged = [
+        (cell.candidate, ceiling[cell.scene] - cell.numbers.psnr_db)
+        for cell in cells
+        if cell.row == BASELINE and cell.candidate is not None and cell.scene in ceiling
+    ]
+    if not judged:
+        return "No candidate was judged.\n"
+    harmful = [harm > HARM_DB for _, harm in judged]
+    lines = []
+    for name in ("overlap", "depth_conflict", "colour_conflict", "cameras_moved_deg"):
+        values = [getattr(candidate, name) for candidate, _ in judged]
+        known = [(-v if name == "overlap" else v, bad) for v, bad in zip(values, harmful, strict=True) if v is not None]
+        told = _separation(known)
+        lines.append([name, str(len(known)), "–" if told is None else f"{told:.2f}"])
+    lines.append(["refused", f"{sum(not c.accepted for c, _ in judged)} of {len(judged)}", "–"])
+    for accepted, title in ((True, "mean loss of the accepted, dB"), (False, "mean loss of the refused, dB")):
+        losses = [harm for candidate, harm in judged if candidate.accepted == accepted]
+        lines.append([title, str(len(losses)), f"{sum(losses) / len(losses):.2f}" if losses else "–"])
+    title = f"tells apart ({sum(harmful)} cost more than {HARM_DB} dB)"
+    return _markdown(["measure", "candidates", title], lines)
+
+
+def _separation(values: Sequence[tuple[float, bool]]) -> float | None:
+    """Area under the ROC curve; None if all are of one kind."""
+    bad, good = [v for v, harmful in values if harmful], [v for v, harmful in values if not harmful]
+    if not bad or not good:
+        return None
+    return sum((b > g) + 0.5 * (b == g) for b in bad for g in good) / (len(bad) * len(good))
+
+
 def _markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     rule = [":--"] + ["--:"] * (len(header) - 1)
     return "\n".join("| " + " | ".join(line) + " |" for line in [header, rule, *lines]) + "\n"

@@ -7,6 +7,7 @@ from sceneexpander.expansion.rounds import (
     captured_prediction,
     initial_state,
     joint_reconstruction,
+    judge_round,
 )
 
 __all__ = [
@@ -18,5 +19,6 @@ __all__ = [
     "captured_prediction",
     "initial_state",
     "joint_reconstruction",
+    "judge_round",
     "load_model",
 ]

@@ -9,8 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.adaptation.acceptance import Acceptance, AcceptanceLimits, judge_candidate
+from sceneexpander.adaptation.config import AdaptConfig, Realign
 from sceneexpander.adaptation.consistency import trusted
+from sceneexpander.adaptation.gaussian_head import fit_gaussian_head
 from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, StepRecord, adapt
 from sceneexpander.adaptation.realign import realign
 from sceneexpander.adaptation.warmup import WarmupConfig, WarmupReport, warm_up
@@ -27,6 +29,7 @@ from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.protocol import Prediction
+from sceneexpander.splatting import render
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,16 +155,25 @@ def adapt_round(
     on_step: Callable[[StepRecord], None] | None = None,
 ) -> tuple[ExpansionState, Reconstruction, AdaptationResult]:
     """Algorithm 1, then the expanded scene with the adapted weights: the state that the next round starts from."""
-    state = inputs.state
-    joint_priors, _ = realign(
-        state.priors,
-        inputs.joint_priors,
-        inputs.anchors,
-        state.views.images,
-        inputs.inserted.view.images[0],
-        config.realign,
-        generator=child_generator(seed, "realign"),
+    priors = realigned_priors(inputs, loaded, config.realign, seed=seed)
+    weights, result = adapted_weights(
+        inputs, priors, loaded, config, seed=seed, checkpoint_folder=checkpoint_folder, on_step=on_step
     )
+    return *finished_round(inputs, priors, weights, loaded, config, seed=seed), result
+
+
+def adapted_weights(
+    inputs: RoundInputs,
+    joint_priors: Priors,
+    loaded: LoadedModel,
+    config: AdaptConfig,
+    *,
+    seed: int,
+    checkpoint_folder: Path | None = None,
+    on_step: Callable[[StepRecord], None] | None = None,
+) -> tuple[WeightsChange, AdaptationResult]:
+    """Algorithm 1 with the given priors of all views (see `realigned_priors`)."""
+    state = inputs.state
     loaded.apply(state.weights)
     result = adapt(
         loaded.model,
@@ -178,11 +190,77 @@ def adapt_round(
         on_step=on_step,
     )
     # Without a step nothing changed: keep the very change that the round started from, bit for bit.
-    weights = WeightsChange.between(loaded.base, result.student) if config.steps else state.weights
-    views = state.views.append(inputs.inserted.view)
-    expanded = ExpansionState(views=views, priors=joint_priors, weights=weights)
+    return (WeightsChange.between(loaded.base, result.student) if config.steps else state.weights), result
+
+
+def finished_round(
+    inputs: RoundInputs,
+    joint_priors: Priors,
+    weights: WeightsChange,
+    loaded: LoadedModel,
+    config: AdaptConfig,
+    *,
+    seed: int,
+) -> tuple[ExpansionState, Reconstruction]:
+    """The expanded scene with adapted weights, after what may follow Algorithm 1: the Gaussian head, and fading."""
+    views = inputs.state.views.append(inputs.inserted.view)
+    if config.splat_steps:
+        loaded.apply(weights)
+        fit_gaussian_head(
+            loaded.model,
+            views.images.to(loaded.device),
+            views.generated.to(loaded.device),
+            _device_priors(joint_priors, loaded),
+            config,
+            seed=seed,
+        )
+        weights = WeightsChange.between(loaded.base, loaded.state())
     reconstruction = reconstruct(views, joint_priors, loaded, weights, method="sceneexpander")
-    return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction, result
+    expanded = ExpansionState(views=views, priors=joint_priors, weights=weights)
+    return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction
+
+
+def judge_round(inputs: RoundInputs) -> Acceptance | None:
+    """Whether the inserted view fits the scene, see `judge_candidate`; None if the front-end did not run for it."""
+    priors = inputs.joint_priors
+    if priors.world_from_cam is None or priors.intrinsics_px is None or priors.depth is None:
+        return None
+    return judge_candidate(
+        inputs.state.priors,
+        priors,
+        inputs.anchors,
+        inputs.state.views.images,
+        inputs.inserted.view.images[0],
+        AcceptanceLimits(),
+    )
+
+
+def realigned_priors(inputs: RoundInputs, loaded: LoadedModel, mode: Realign, *, seed: int) -> Priors:
+    """The joint priors as the adaptation takes them, see `realign`.
+
+    `Realign.CHOOSE` makes the scene from both estimates with the weights that the round starts from, and takes the one whose
+    Gaussians show the captured photos with the smaller squared error. Only what the user gave is looked at.
+    """
+    state, generator = inputs.state, child_generator(seed, "realign")
+    arguments = (state.priors, inputs.joint_priors, inputs.anchors, state.views.images, inputs.inserted.view.images[0])
+    if mode is not Realign.CHOOSE:
+        return realign(*arguments, mode, generator=generator)[0]
+    held, _ = realign(*arguments, Realign.HOLD, generator=generator)
+    views = state.views.append(inputs.inserted.view)
+    errors = [
+        _photo_error(predict(views, priors, loaded, state.weights), views) for priors in (inputs.joint_priors, held)
+    ]
+    return held if errors[1] < errors[0] else inputs.joint_priors
+
+
+def _photo_error(prediction: Prediction, views: ViewSet) -> float:
+    """Mean squared error of the captured photos against what all Gaussians show there."""
+    if prediction.gaussians is None:
+        raise ValueError("a rendered picture needs the Gaussian head")
+    captured = torch.nonzero(~views.generated)[:, 0].tolist()
+    poses, intrinsics = prediction.world_from_cam[captured], prediction.intrinsics_px[captured]
+    shown = render(prediction.gaussians, poses, intrinsics, views.height, views.width).rgb.clamp(0, 1)
+    return float((shown.cpu() - views.images[captured]).square().mean())
 
 
 def _device_priors(priors: Priors, loaded: LoadedModel) -> Priors | None:

@@ -217,20 +217,6 @@ def test_views_and_anchors_must_match(change: Callable[[AdaptationInputs], Adapt
         _run(inputs=change(_inputs()))
 
 
-def test_the_photo_comparison_runs_the_gaussian_head_when_it_is_due() -> None:
-    model = TinyReconstructor()
-    config = replace(FAST, steps=12, lambda_splat=5.0, splat_every=3, lambda_anchor=0.0, restore_interval=0)
-    records = adapt(model, _inputs(), config, seed=0).records
-    assert model.runs["gaussians"] == 4
-    assert [record.step for record in records if record.splat > 0] == [3, 6, 9, 12]
-    assert records[2].loss == pytest.approx(5 * records[2].splat + _without_splat(records[2], config), rel=1e-4)
-
-
-def _without_splat(record: StepRecord, config: AdaptConfig) -> float:
-    gen = record.gen_camera + record.gen_depth + record.gen_normal
-    return config.lambda_gen * gen + config.lambda_reg * record.drift
-
-
 def test_consistent_weights_change_the_inserted_loss_only() -> None:
     config = replace(FAST, insertion_probability=1.0, lambda_anchor=0.0, lambda_reg=0.0, augment=NO_AUGMENT)
     weighted = _run(replace(config, inserted_weights=InsertedWeights.CONSISTENT))

@@ -93,3 +93,11 @@ def test_a_changed_row_is_measured_again_and_a_renamed_one_is_not(
     changed = Plan(scenes=plan.scenes, grades=plan.grades, rows={"full": AdaptConfig(steps=4)}, seeds=(0,))
     run(changed, settings(tmp_path))
     assert len(measured) == count + 1
+
+
+def test_finished_cells_can_be_looked_at_without_running_any(tmp_path: Path, measured: list[tuple[str, ...]]) -> None:
+    assert run(PLAN, settings(tmp_path, finished_only=True)) == []
+    one = Plan(scenes=("room_1",), grades=("mixed_1",), rows={}, seeds=(0,))
+    run(one, settings(tmp_path))
+    assert [cell.row for cell in run(PLAN, settings(tmp_path, finished_only=True))] == [CAPTURED, BASELINE]
+    assert len(measured) == 2

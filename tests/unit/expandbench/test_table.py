@@ -7,10 +7,20 @@ from pathlib import Path
 
 import pytest
 
+from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.expandbench.measure import BenchNumbers
 from sceneexpander.expandbench.plot import curve, plot
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
-from sceneexpander.expandbench.table import COLUMNS, curve_table, main_table, mean_of, paired, row_names, seed_spread
+from sceneexpander.expandbench.table import (
+    COLUMNS,
+    acceptance_table,
+    curve_table,
+    main_table,
+    mean_of,
+    paired,
+    row_names,
+    seed_spread,
+)
 
 PSNR = COLUMNS[0]
 DEPTH = next(column for column in COLUMNS if column.name == "depth_abs_rel")
@@ -104,3 +114,27 @@ def test_a_curve_is_relative_to_the_pre_insertion_scene(tmp_path: Path) -> None:
     assert plot(cells, tmp_path / "curve.svg")
     assert (tmp_path / "curve.svg").read_bytes() == first
     assert not plot(CELLS[:2], tmp_path / "none.svg")
+
+
+def test_the_acceptance_table_counts_and_separates() -> None:
+    def judged(scene: str, psnr: float, depth: float, reasons: tuple[str, ...]) -> CellResult:
+        candidate = Acceptance(
+            posed=True, overlap=0.5, depth_conflict=depth, colour_conflict=None, cameras_moved_deg=0.0, reasons=reasons
+        )
+        return replace(cell(scene, BASELINE, psnr), candidate=candidate)
+
+    cells = [
+        *CELLS[:2],
+        judged("a", 19.0, 0.3, ("depth",)),  # costs 2 dB
+        judged("a", 20.9, 0.1, ()),
+        judged("b", 22.9, 0.2, ()),
+        judged("b", 22.0, 0.15, ()),  # costs 1 dB
+    ]
+    text = acceptance_table(cells)
+    assert "2 cost more than 0.5 dB" in text
+    assert "| depth_conflict | 4 | 0.75 |" in text  # of the four pairs, 0.15 < 0.2 is the wrong way round
+    assert "| overlap | 4 | 0.50 |" in text
+    assert "| colour_conflict | 0 | – |" in text
+    assert "| refused | 1 of 4 | – |" in text
+    assert "| mean loss of the refused, dB | 1 | 2.00 |" in text
+    assert acceptance_table(CELLS[:2]).startswith("No candidate")

@@ -1,0 +1,97 @@
+"""Rows of the ablation on scene folders without known truth: python scripts/real_ablation.py FOLDER ... --rows full,guarded
+
+A folder is as in ``scenes/`` (photos in captured/, a scene.yaml whose first round names an inserted picture). Prints one line per row: what
+preservation and insertion can be measured without truth. The pre-insertion scene and the backbone are always there.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.views import ViewSet, save_png
+from sceneexpander.config.compose import compose
+from sceneexpander.config.parse import parse_dataclass
+from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.evaluation import EvaluateConfig, evaluate
+from sceneexpander.expansion import RoundInputs, adapt_round, captured_prediction, initial_state, joint_reconstruction
+from sceneexpander.expansion.loaded import load_model
+from sceneexpander.generation import generate_inserted_view
+from sceneexpander.ingest import load_scene
+from sceneexpander.project import find_project
+from sceneexpander.splatting import render
+
+
+def composed(row: str, overrides: list[str]) -> ProjectConfig:
+    """The configuration of a row."""
+    return parse_dataclass(ProjectConfig, compose(find_project() / "conf", [f"ablation={row}", *overrides]))
+
+
+def line(name: str, reconstruction: Reconstruction, views: ViewSet) -> str:
+    """The numbers of one row."""
+    row = evaluate(reconstruction, views, EvaluateConfig(), scene="-", round_number=1, seed=0)
+    inserted = "     -" if row.inserted_psnr_db is None else f"{row.inserted_psnr_db:6.2f}"
+    others = "     -" if row.others_psnr_db is None else f"{row.others_psnr_db:6.2f}"
+    return f"{name:24s} PSNR {row.psnr_db:6.2f}  SSIM {row.ssim:.3f}  cross-view {others}  insertion {inserted}"
+
+
+def pictures(reconstruction: Reconstruction, path: Path) -> None:
+    """All views as the reconstruction shows them, in a row."""
+    height, width = reconstruction.depth.shape[1:]
+    shown = render(reconstruction.gaussians, reconstruction.world_from_cam, reconstruction.intrinsics_px, height, width)
+    save_png(path, torch.cat(list(shown.rgb), dim=-1))
+
+
+def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], out: Path | None) -> None:
+    """Print all lines of one scene."""
+    config = composed("none", overrides)
+    loaded = load_model(config.model, config.device)
+    scene = load_scene(folder, config.scene)
+    state, _, _, _ = initial_state(scene, loaded, config.frontend, config.warmup, seed=config.seed)
+    anchors, captured = captured_prediction(state, loaded)
+    inserted: InsertedView
+    inserted, _ = generate_inserted_view(scene, 1, state.views, folder, config.generator, seed=config.seed)
+    priors, backbone, _ = joint_reconstruction(state, inserted, loaded, config.frontend, seed=config.seed)
+    inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
+    views = state.views.append(inserted.view)
+    print(
+        f"{scene.name}: {len(state.views)} photos of {views.height} x {views.width}, inserted view posed: {bool(backbone.posed[-1])}"
+    )
+    made = {"captured": captured, "baseline": backbone}
+    for name, reconstruction in made.items():
+        print(line(name, reconstruction, views), flush=True)
+    for row in rows:
+        adapt: AdaptConfig = replace(composed(row, overrides).adapt, checkpoint_every=0)
+        for seed in seeds:
+            _, reconstruction, _ = adapt_round(inputs, loaded, adapt, seed=seed)
+            print(line(f"{row} seed {seed}", reconstruction, views), flush=True)
+        made[row] = reconstruction
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, reconstruction in made.items():
+            pictures(reconstruction, out / f"{scene.name}-{name}.png")
+        save_png(out / f"{scene.name}-photos.png", torch.cat(list(views.images), dim=-1))
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("--rows", default="full,guarded")
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--set", default=[], action="append", metavar="KEY=VALUE", help="configuration override")
+    parser.add_argument("--out", type=Path, help="folder for pictures")
+    options = parser.parse_args()
+    rows = [row for row in options.rows.split(",") if row]
+    for folder in options.folders:
+        run(folder, rows, options.set, [int(seed) for seed in options.seeds.split(",")], options.out)
+
+
+if __name__ == "__main__":
+    main()
