@@ -18,7 +18,8 @@ class ViewMetrics:
     """What one view's camera sees of the reconstruction, against that view's picture. None: not defined there.
 
     ``psnr_db`` is capped (equal images would be infinite). ``coverage`` is the share of pixels with alpha above the threshold.
-    ``depth_disagreement`` is the median of |rendered - per-view depth| / per-view depth over covered pixels. The ``others_`` columns use
+    ``depth_disagreement`` is the median of |rendered - per-view depth| / per-view depth over covered pixels (0 for optimised methods, whose
+    depth is the rendered one). The ``others_`` columns use
     only Gaussians that came from *other* views, over the pixels that those cover (share ``others_coverage``): a picture that agrees with
     its neighbours scores high, doubled contours (ghosting) score low. ``generated_share`` is the part of alpha that Gaussians
     of generated views contribute.

@@ -45,7 +45,7 @@ METHODS = {
         label="3DGS per scene, from {model}",
         short="optimised on all views",
         meaning="Gaussians optimised on the captured photos and the inserted picture, started from the cameras and Gaussians of {model} "
-        "with the inserted view.",
+        "with the inserted view. PSNR and SSIM are those of pictures it was fitted to.",
     ),
     "omnivggt": MethodWords(
         label="OmniVGGT, pixel-aligned",
@@ -70,7 +70,7 @@ METHODS = {
     "sceneexpander_optimised": MethodWords(
         label="SceneExpander on {model} + post-optimisation",
         short="adapted, then optimised",
-        meaning="SceneExpander's Gaussians optimised further on the same pictures: an addition, not the method.",
+        meaning="SceneExpander's Gaussians fitted further to the same pictures: an addition, not the method.",
     ),
     "sceneexpander": MethodWords(
         label="SceneExpander on {model}",
