@@ -12,7 +12,7 @@ from sceneexpander.artifacts.unavailable import Unavailable, unavailable_in
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.files import read_sections
 from sceneexpander.optimisation.config import OptimiseConfig
-from sceneexpander.optimisation.optimise import FEWEST_VIEWS, optimise
+from sceneexpander.optimisation.optimise import optimise, unusable
 from sceneexpander.progress import progress_bar
 from stages import layout
 from stages.runner import Cell, checkpoint_folder, left_out, remove_folder, run_identity, stage, use_threads
@@ -39,8 +39,8 @@ def optimise_from(cell: Cell, start: str) -> None:
         _write_reason(Unavailable(method=cell.method, model=lacking.model, reason=lacking.reason), target)
         return
     reconstruction = Reconstruction.load(made)
-    if int(reconstruction.posed.sum()) < FEWEST_VIEWS:
-        reason = f"needs {FEWEST_VIEWS} views with known cameras"
+    reason = unusable(reconstruction)
+    if reason is not None:
         _write_reason(Unavailable(method=cell.method, model=reconstruction.model, reason=reason), target)
         return
     sources = (

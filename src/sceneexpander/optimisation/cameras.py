@@ -17,7 +17,7 @@ class RefinedCameras:
 
     def __init__(self, world_from_cam: Float[Tensor, "view 4 4"], *, rate: float, extent: float) -> None:
         self._start = rigid_inverse(world_from_cam)
-        self._extent = extent
+        self._extent, self._rate = extent, rate
         self.motion = nn.Parameter(torch.zeros(len(world_from_cam), 6).to(world_from_cam))
         self._optimiser = torch.optim.Adam([self.motion], lr=rate) if rate > 0 else None
         self.motion.requires_grad_(self._optimiser is not None)
@@ -31,9 +31,10 @@ class RefinedCameras:
         moved = rigid_from_parts(turn, self.motion[view : view + 1, 3:] * self._extent)
         return moved @ self._start[view : view + 1]
 
-    def step(self) -> None:
-        """One optimiser step of the views that were drawn since the last one."""
+    def step(self, share: float) -> None:
+        """One optimiser step of the views that were drawn since the last one, at a share of the learning rate."""
         if self._optimiser is not None and self.motion.grad is not None:
+            self._optimiser.param_groups[0]["lr"] = share * self._rate
             self._optimiser.step()
             self._optimiser.zero_grad(set_to_none=True)
 

@@ -21,7 +21,7 @@ class RatesConfig:
     opacities: float = 5e-2
     colours: float = 2.5e-3
     view_colours: float = 1.25e-4  # of the coefficients that depend on the direction
-    poses: float = 0.0  # of the cameras, rotation in radians and translation in extents; 0: cameras stay
+    poses: float = 0.0  # of the cameras, rotation in radians and translation in extents; falls like that of the means; 0: cameras stay
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -48,6 +48,13 @@ def scene_extent(reconstruction: Reconstruction) -> float:
     return max(_EXTENT_MARGIN * radius, _LEAST_EXTENT * float(reconstruction.depth[known].median()))
 
 
+def unusable(start: Reconstruction) -> str | None:
+    """Why nothing can be optimised from a reconstruction, as its row will say, or None."""
+    if int(start.posed.sum()) < FEWEST_VIEWS:
+        return f"needs {FEWEST_VIEWS} views with known cameras"
+    return None
+
+
 def optimise(
     start: Reconstruction,
     images: Float[Tensor, "view 3 height width"],
@@ -74,11 +81,12 @@ def optimise(
         on_step: told the number of finished steps and the last loss.
 
     Raises:
-        ValueError: fewer than `FEWEST_VIEWS` views have known cameras, or sizes do not fit.
+        ValueError: the start is `unusable`, or sizes do not fit.
     """
-    if int(start.posed.sum()) < FEWEST_VIEWS or images.shape[2:] != start.depth.shape[1:]:
+    problem = unusable(start)
+    if problem is not None or images.shape[2:] != start.depth.shape[1:]:
         raise ValueError(
-            f"{int(start.posed.sum())} posed views of {tuple(images.shape)} pictures cannot be optimised on"
+            problem or f"pictures of {tuple(images.shape)} do not fit depths of {tuple(start.depth.shape)}"
         )
     run = _Run(start, images, config, seed=seed, device=torch.device(device))
     first = run.resume(checkpoint_folder)
@@ -143,7 +151,7 @@ class _Run:
         facts = Seen(centre_gradient=offsets.grad[0], radius_px=seen.radius_px[0], height=height, width=width)
         self._density.observe(splats, facts, step)
         splats.step()
-        self._cameras.step()
+        self._cameras.step(rate / (self._extent * self._config.rates.means))
         generator = child_generator(self._seed, f"optimise/density/{step}")
         self._density.change(splats, step, mean_rate=rate, generator=generator)
         self.losses.append(float(loss.detach()))

@@ -16,7 +16,7 @@ from sceneexpander.evaluation.views import preservation
 from sceneexpander.geometry.camera import project_points
 from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
 from sceneexpander.optimisation.config import DensityConfig, OptimiseConfig, RatesConfig
-from sceneexpander.optimisation.optimise import optimise, photometric_loss, scene_extent
+from sceneexpander.optimisation.optimise import optimise, photometric_loss, scene_extent, unusable
 from tests.unit.evaluation.made import made_reconstruction, own_pictures
 
 TRUTH = made_reconstruction()
@@ -144,7 +144,7 @@ def test_cameras_stay_unless_they_may_move_and_then_they_move_the_right_way() ->
 
     fixed = dict.fromkeys(("means", "means_final", "scales", "rotations", "opacities", "colours"), 1e-09)
     still = OptimiseConfig(steps=90, sh_degree=0, rates=RatesConfig(**fixed), density=DensityConfig(every=1000))
-    free = replace(still, rates=RatesConfig(poses=5e-4, **fixed))
+    free = replace(still, rates=RatesConfig(poses=1e-3, **fixed))
     results = [optimise(start, pictures, config, method="m", seed=0).reconstruction for config in (still, free)]
     assert torch.equal(results[0].world_from_cam[0], turned[0])
     torch.testing.assert_close(results[0].world_from_cam, turned)
@@ -162,8 +162,13 @@ def test_a_view_without_a_camera_has_no_say() -> None:
         for images in (VIEWS.images, noise)
     ]
     assert torch.equal(*results)
-    with pytest.raises(ValueError, match="1 posed views"):
-        optimise(replace(unposed, posed=torch.tensor([True, False, False])), noise, SHORT, method="m", seed=0)
+    assert unusable(unposed) is None
+    alone = replace(unposed, posed=torch.tensor([True, False, False]))
+    assert unusable(alone) == "needs 2 views with known cameras"
+    with pytest.raises(ValueError, match="needs 2 views"):
+        optimise(alone, noise, SHORT, method="m", seed=0)
+    with pytest.raises(ValueError, match="do not fit"):
+        optimise(unposed, noise[..., 1:], SHORT, method="m", seed=0)
 
 
 def test_the_extent_is_that_of_the_known_cameras() -> None:
