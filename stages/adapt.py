@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from dataclasses import asdict, dataclass
 
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.loop import StepRecord
+from sceneexpander.adaptation.observe import Look, warnings_of
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.live import LiveLog
 from sceneexpander.artifacts.state import ExpansionState, load_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, judge_round, load_model
 from sceneexpander.progress import progress_bar
 from stages import layout
-from stages.runner import Cell, checkpoint_folder, remove_folder, run_identity, stage, use_threads
+from stages.runner import Cell, checkpoint_folder, live_folder, remove_folder, run_identity, stage, use_threads
+
+LOOKS = "looks"  # pictures of the looks, in the log and in the result
 
 _log = logging.getLogger(__name__)
 
@@ -53,22 +58,41 @@ def main(cell: Cell) -> None:
         _log.warning(
             "%s round %d: the inserted view fits badly: %s", cell.scene, cell.round, "; ".join(verdict.reasons)
         )
-    checkpoints = checkpoint_folder(run_identity(sections, sources))
+    identity = run_identity(sections, sources)
+    checkpoints, live = checkpoint_folder(identity), live_folder(identity)
     loaded = load_model(sections.model, sections.device)
+    log = LiveLog(live, {"scene": cell.scene, "round": cell.round, "steps": sections.adapt.steps, "sections": sections})
     with progress_bar(f"adapt {cell.scene} round {cell.round}", sections.adapt.steps) as bar:
 
         def on_step(record: StepRecord) -> None:
             bar.update(record.step, record.loss)
+            log.write("step", record)
+
+        def on_look(look: Look) -> None:
+            log.write("look", look)
 
         state, reconstruction, result = adapt_round(
-            inputs, loaded, sections.adapt, seed=sections.seed, checkpoint_folder=checkpoints, on_step=on_step
+            inputs,
+            loaded,
+            sections.adapt,
+            seed=sections.seed,
+            checkpoint_folder=checkpoints,
+            on_step=on_step,
+            on_look=on_look,
+            looks_folder=live / LOOKS,
         )
+    warnings = warnings_of(result.looks)
     with directory_being_written(layout.state(cell.scene, cell.round)) as folder:
         state.save(folder)
         reconstruction.save(folder / "reconstruction")
         if verdict is not None:
             write_json_atomic(folder / "acceptance.json", verdict)
         write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])
+        looks = {"identity": identity, "looks": [asdict(look) for look in result.looks], "warnings": warnings}
+        write_json_atomic(folder / "looks.json", looks)
+        if result.looks:
+            shutil.copytree(live / LOOKS, folder / LOOKS)
+    log.end({"warnings": warnings})
     remove_folder(checkpoints)
 
 

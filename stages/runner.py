@@ -22,7 +22,7 @@ from sceneexpander.artifacts.store import directory_being_written, write_bytes_a
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import EXIT_BAD_INPUT, UserError
-from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV
+from sceneexpander.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
 from stages import layout
 
 
@@ -54,6 +54,11 @@ def run_identity(sections: object, inputs: Sequence[Path]) -> str:
             digest.update(f"{path.as_posix()}\n".encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:32]
+
+
+def live_folder(key: str) -> Path:
+    """Where a running adaptation of this identity keeps its log and pictures; see `sceneexpander.artifacts.live`."""
+    return project_root() / LIVE_FOLDER / key
 
 
 def stage(*axes: str) -> Callable[[Callable[[Cell], None]], Callable[[], None]]:

@@ -13,6 +13,8 @@ ERROR_FILE_ENV = (
 )
 SWEEP_ENV = "SCENEEXPANDER_SWEEP"  # set in the jobs of a sweep: its id, a tag of the recorded runs
 
+LIVE_FOLDER = Path(".cache") / "live"  # in the project folder: logs of running adaptations
+
 
 def find_project() -> Path:
     """The project folder: named by the environment, or the nearest one above the current folder, or the one of this installation.

@@ -1,4 +1,4 @@
-"""``python -m sceneexpander.ui``: MLflow's interface over the local store, on loopback only."""
+"""``python -m sceneexpander.ui``: MLflow's interface over the local store, on loopback only; running adaptations show live."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import subprocess
 import sys
 
 from sceneexpander.errors import UserError, entry_point
-from sceneexpander.project import find_project
+from sceneexpander.project import LIVE_FOLDER, find_project
 from sceneexpander.tracking.config import TrackingConfig
+from sceneexpander.tracking.follow import Follower
 from sceneexpander.tracking.store import database_path, quiet_environment, tracking_uri
 
 
@@ -21,6 +22,8 @@ def main() -> None:
     port = parser.parse_args().port
     root = find_project()
     if not database_path(root).is_file():
+        Follower(root / LIVE_FOLDER, root, TrackingConfig()).poll()  # the first run of all may still be under way
+    if not database_path(root).is_file():
         raise UserError("does not exist yet", where=database_path(root), fix="run `make repro` first")
     quiet_environment()
     # The landing page is about something else; experiment 1 is the first one made after MLflow's own default.
@@ -28,10 +31,13 @@ def main() -> None:
     print(f"charts:   {base}CHART\npictures: {base}ARTIFACT", flush=True)
     command = [sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port)]
     command += ["--backend-store-uri", tracking_uri(TrackingConfig(), root)]
+    follower = subprocess.Popen([sys.executable, "-m", "sceneexpander.follow"], cwd=root)
     try:
         raise SystemExit(subprocess.call(command, cwd=root, env=dict(os.environ)))
     except KeyboardInterrupt:
         raise SystemExit(0) from None
+    finally:
+        follower.terminate()
 
 
 if __name__ == "__main__":

@@ -143,6 +143,7 @@ def load_artifact(folder: Path, schema: str) -> tuple[dict[str, Any], dict[str, 
 
 def load_resume_point(folder: Path, schema: str, run_key: str) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
     """(facts, tensors) of an artefact whose fact ``run_key`` is the given one, or None; what else lies there is reported and ignored."""
+    _tidy(folder)
     if not folder.exists():
         return None
     try:
@@ -191,3 +192,14 @@ def _byte_dtype() -> Any:
     import torch
 
     return torch.uint8
+
+
+def _tidy(folder: Path) -> None:
+    """Clear what a killed writer left: half a new resume point, or the old one already moved aside (which is whole)."""
+    for old in folder.parent.glob(f".{folder.name}.*.old"):
+        if folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            old.rename(folder)
+    for scratch in folder.parent.glob(f".{folder.name}.*.part"):
+        shutil.rmtree(scratch, ignore_errors=True)

@@ -14,6 +14,7 @@ from sceneexpander.adaptation.config import AdaptConfig, Realign
 from sceneexpander.adaptation.consistency import trusted
 from sceneexpander.adaptation.gaussian_head import fit_gaussian_head
 from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, StepRecord, adapt
+from sceneexpander.adaptation.observe import Look
 from sceneexpander.adaptation.realign import realign
 from sceneexpander.adaptation.warmup import WarmupConfig, WarmupReport, warm_up
 from sceneexpander.artifacts.anchors import Anchors
@@ -153,6 +154,8 @@ def adapt_round(
     seed: int,
     checkpoint_folder: Path | None = None,
     on_step: Callable[[StepRecord], None] | None = None,
+    on_look: Callable[[Look], None] | None = None,
+    looks_folder: Path | None = None,
 ) -> tuple[ExpansionState, Reconstruction, AdaptationResult]:
     """Algorithm 1, then the expanded scene with the adapted weights: the state that the next round starts from."""
     priors = realigned_priors(inputs, loaded, config.realign, seed=seed)
@@ -188,6 +191,8 @@ def adapted_weights(
         seed=seed,
         checkpoint_folder=checkpoint_folder,
         on_step=on_step,
+        on_look=on_look,
+        looks_folder=looks_folder,
     )
     # Without a step nothing changed: keep the very change that the round started from, bit for bit.
     return (WeightsChange.between(loaded.base, result.student) if config.steps else state.weights), result

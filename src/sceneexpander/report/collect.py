@@ -26,7 +26,17 @@ from sceneexpander.viewer.page import ShownMethod, viewer_page
 FACTS = "page.json"
 MAIN_METHOD = "sceneexpander"
 _PICTURE_SIDE_PX = 720
-_LOSSES = ("loss", "anchor_camera", "anchor_depth", "anchor_normal", "gen_camera", "gen_depth", "gen_normal", "drift")
+_LOSSES = (
+    "loss",
+    "anchor_camera",
+    "anchor_depth",
+    "anchor_normal",
+    "gen_camera",
+    "gen_depth",
+    "gen_normal",
+    "drift",
+    "gradient_norm",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +52,10 @@ class MethodSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoundSource:
-    """Artefacts of one round. ``log`` is the adaptation's, ``statistics`` holds one file per stage run."""
+    """Artefacts of one round.
+
+    ``log`` is the adaptation's, with its looks (``looks.json``, ``looks/``) beside it; ``statistics`` holds one file per stage run.
+    """
 
     number: int
     inserted: Path
@@ -138,6 +151,7 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
         shutil.copyfile(sheet, folder / base / "sheet.png")
     spec = scene.round_spec(source.number)
     log = read_json(source.log)
+    looks = _looks(source.log.parent, folder, base)
     missing = {item.name: lacking for item in source.methods if (lacking := unavailable_in(item.reconstruction))}
     methods = [_method(item, folder, f"{base}/{item.name}") for item in source.methods if item.name not in missing]
     return {
@@ -166,8 +180,27 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
             if item.name in missing
         ],
         "series": {name: [record[name] for record in log] for name in _LOSSES if log and name in log[0]},
+        "looks": looks,
         "statistics": _statistics(source.statistics),
-        "warnings": _warnings(methods, chosen.parameters),
+        "warnings": _warnings(methods, chosen.parameters) + (looks["warnings"] if looks else []),
+    }
+
+
+def _looks(source: Path, folder: Path, base: str) -> dict[str, Any] | None:
+    """What the adaptation saw of itself, with its pictures; None if it never looked."""
+    path = source / "looks.json"
+    facts = read_json(path) if path.is_file() else None
+    if facts is None or not facts["looks"]:
+        return None
+    pictures = [
+        _copy(picture, folder, f"{base}/looks/{picture.name}") for picture in sorted((source / "looks").glob("*.jpg"))
+    ]
+    sentences = [f"{text[0].upper()}{text[1:]}." for text in facts["warnings"]]
+    return {
+        "identity": facts["identity"],
+        "entries": facts["looks"],
+        "pictures": pictures,
+        "warnings": sentences,
     }
 
 

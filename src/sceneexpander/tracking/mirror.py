@@ -8,7 +8,9 @@ from typing import Any
 
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.store import read_json
+from sceneexpander.tracking.follow import look_numbers
 from sceneexpander.tracking.record import RunRecord, flatten, run_key
+from sceneexpander.tracking.store import LIVE_TAG
 
 FACTS = "page.json"
 
@@ -69,7 +71,8 @@ def _run(
         },
         metrics=metrics,
         series={f"loss/{key}": tuple(values) for key, values in item["series"].items()} if adapted else {},
-        artefacts=_artefacts(item, method, folder, extra),
+        sparse=_looks(item) if adapted else {},
+        artefacts=_artefacts(item, method, folder, extra) | (_look_pictures(item, folder) if adapted else {}),
         tags={
             "scene": scene,
             "round": str(number),
@@ -79,10 +82,25 @@ def _run(
             "weights_sha256": row.weights_sha256,
             "base_weights_sha256": str(facts["model"]["weights_sha256"]),
             "mlflow.source.git.commit": commit,
+            **({LIVE_TAG: item["looks"]["identity"]} if adapted and item["looks"] else {}),
         },
         started_ms=int(1000 * min((entry["started"] for entry in stages.values()), default=0.0)),
         duration_ms=int(1000 * sum(entry["wall_s"] for entry in stages.values())),
     )
+
+
+def _looks(item: Mapping[str, Any]) -> dict[str, list[tuple[int, float]]]:
+    """Curves of what the adaptation's looks saw."""
+    curves: dict[str, list[tuple[int, float]]] = {}
+    for look in item["looks"]["entries"] if item["looks"] else ():
+        for name, value in look_numbers(look).items():
+            curves.setdefault(name, []).append((look["step"], value))
+    return curves
+
+
+def _look_pictures(item: Mapping[str, Any], folder: Path) -> dict[str, Path]:
+    pictures = item["looks"]["pictures"] if item["looks"] else ()
+    return {f"looks/{Path(path).name}": folder / path for path in pictures}
 
 
 def _unavailable(

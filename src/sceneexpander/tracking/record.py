@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,9 @@ class RunRecord:
         key: identity; a run that is already recorded under it is not recorded again.
         name: as shown in lists.
         params: resolved configuration, dotted keys.
-        metrics: final numbers; series hold one value per step.
+        metrics: final numbers.
+        series: one value per step.
+        sparse: (step, value) where there is not one per step.
         artefacts: files by their path in the run; pictures are shown by the interface as such.
         tags: facts to filter by.
         started_ms: epoch milliseconds of the work itself (not of the recording), so that repeating the recording gives the same run.
@@ -30,6 +32,7 @@ class RunRecord:
     params: Mapping[str, str]
     metrics: Mapping[str, float]
     series: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    sparse: Mapping[str, Sequence[tuple[int, float]]] = field(default_factory=dict)
     artefacts: Mapping[str, Path] = field(default_factory=dict)
     tags: Mapping[str, str] = field(default_factory=dict)
     started_ms: int = 0

@@ -18,6 +18,7 @@ from sceneexpander.tracking.record import RunRecord
 _log = logging.getLogger(__name__)
 
 KEY_TAG = "run_key"
+LIVE_TAG = "adaptation"  # identity of the adaptation that a run mirrors or holds, see `sceneexpander.tracking.follow`
 COMPLETE_TAG = "complete"  # set last: a recording that was killed half-way is done again
 _PARAMS_PER_CALL = 100  # limits of MLflow's batch call
 _METRICS_PER_CALL = 1000
@@ -71,11 +72,12 @@ def record_runs(
         missing = [record for record in records if record.key not in known]
         if not missing and sweep is None:
             return 0, len(records)
-        client, experiment = _open(config, root)
+        client, experiment = open_store(config, root)
         known |= _complete(client, experiment)
         missing = [record for record in records if record.key not in known]
         for record in missing:
             known[record.key] = _record(client, experiment, record)
+            _remove_mirrored(client, experiment, record)
         if sweep is not None:
             for record in records:
                 client.set_tag(known[record.key], f"sweep.{sweep}", "1")
@@ -102,7 +104,8 @@ def _complete_local(root: Path, config: TrackingConfig) -> dict[str, str]:
         return {}  # an empty or half-made file: MLflow will say what it thinks of it
 
 
-def _open(config: TrackingConfig, root: Path) -> tuple[Any, str]:
+def open_store(config: TrackingConfig, root: Path) -> tuple[Any, str]:
+    """(client, id of the experiment), made if there is none."""
     quiet_environment()
     from mlflow.exceptions import MlflowException
     from mlflow.tracking import MlflowClient
@@ -140,6 +143,16 @@ def _complete(client: Any, experiment: str) -> dict[str, str]:
             return found
 
 
+def _remove_mirrored(client: Any, experiment: str, record: RunRecord) -> None:
+    """Delete the run that mirrored this one while it was running."""
+    identity = record.tags.get(LIVE_TAG)
+    if identity is None:
+        return
+    for run in client.search_runs([experiment], f"tags.{LIVE_TAG} = '{identity}'"):
+        if KEY_TAG not in run.data.tags:
+            client.delete_run(run.info.run_id)
+
+
 def _record(client: Any, experiment: str, record: RunRecord) -> str:
     from mlflow.entities import Metric, Param
 
@@ -153,6 +166,9 @@ def _record(client: Any, experiment: str, record: RunRecord) -> str:
         # Steps are spread over the run's time: MLflow orders equal times arbitrarily.
         pace = record.duration_ms / max(len(values), 1)
         metrics += [Metric(key, v, record.started_ms + int(i * pace), i + 1) for i, v in enumerate(values)]
+    for key, points in sorted(record.sparse.items()):
+        pace = record.duration_ms / max(max((step for step, _ in points), default=1), 1)
+        metrics += [Metric(key, v, record.started_ms + int(step * pace), step) for step, v in points]
     for start in range(0, len(params), _PARAMS_PER_CALL):
         client.log_batch(run_id, params=params[start : start + _PARAMS_PER_CALL])
     for start in range(0, len(metrics), _METRICS_PER_CALL):

@@ -10,6 +10,7 @@ from sceneexpander.adaptation.loop import (
     AdaptationInputs,
     AdaptationResult,
     NonFiniteLoss,
+    Run,
     StepRecord,
     adapt,
 )
@@ -153,6 +154,20 @@ def test_a_damaged_checkpoint_is_ignored(tmp_path: Path) -> None:
     assert _bits(adapt(TinyReconstructor(), inputs, FAST, seed=0, checkpoint_folder=folder)) == _bits(
         _run(inputs=inputs)
     )
+
+
+def test_a_checkpoint_that_was_just_being_replaced_is_not_lost(tmp_path: Path) -> None:
+    inputs, folder = _inputs(), tmp_path / "checkpoint"
+    adapt(TinyReconstructor(), inputs, FAST, seed=0, checkpoint_folder=folder)
+    folder.rename(tmp_path / ".checkpoint.0123abcd.old")  # killed between the two renames
+    (tmp_path / ".checkpoint.4567cdef.part").mkdir()
+    steps: list[int] = []
+    original = Run.step
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Run, "step", lambda self, step: steps.append(step) or original(self, step))
+        adapt(TinyReconstructor(), inputs, FAST, seed=0, checkpoint_folder=folder)
+    assert steps == [7, 8], "it goes on from step 6"
+    assert {path.name for path in tmp_path.iterdir()} == {"checkpoint"}
 
 
 @pytest.mark.parametrize("captured", [1, 2, 3, 4])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -15,20 +14,6 @@ from sceneexpander.tracking import RunRecord, TrackingConfig, flatten, record_ru
 from sceneexpander.tracking.store import COMPLETE_TAG, database_path, quiet_environment, tracking_uri
 
 CONFIG = TrackingConfig(uri="local", experiment="tests")
-
-
-@pytest.fixture(scope="session")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An empty store: making one takes seconds, copying it none."""
-    root = tmp_path_factory.mktemp("store")
-    record_runs([record(root, "made with the template")], TrackingConfig(experiment="template"), root)
-    return root
-
-
-@pytest.fixture
-def root(template: Path, tmp_path: Path) -> Path:
-    shutil.copytree(template, tmp_path / "project")
-    return tmp_path / "project"
 
 
 def record(folder: Path, key: str) -> RunRecord:

@@ -1,0 +1,39 @@
+"""``python -m sceneexpander.follow``: mirror running adaptations into MLflow, so that their curves can be watched."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import time
+
+from sceneexpander.errors import UserError, entry_point
+from sceneexpander.project import LIVE_FOLDER, find_project
+from sceneexpander.tracking.config import TrackingConfig
+from sceneexpander.tracking.follow import Follower
+
+
+@entry_point
+def main() -> None:
+    """Follow until interrupted."""
+    parser = argparse.ArgumentParser(prog="python -m sceneexpander.follow", description=__doc__)
+    parser.add_argument("--uri", default="local", help="of MLflow: local, or http://host:port")
+    parser.add_argument("--interval", type=float, default=2.0, help="seconds between looks at the logs")
+    parser.add_argument("--once", action="store_true", help="mirror what is there and end")
+    options = parser.parse_args()
+    if options.interval <= 0:
+        raise UserError(f"must be above 0, is {options.interval}", where="--interval")
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s follow: %(message)s")
+    root = find_project()
+    follower = Follower(root / LIVE_FOLDER, root, TrackingConfig(uri=options.uri))
+    try:
+        while True:
+            follower.poll()
+            if options.once:
+                return
+            time.sleep(options.interval)
+    except KeyboardInterrupt:
+        return
+
+
+if __name__ == "__main__":
+    main()

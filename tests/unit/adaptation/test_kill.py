@@ -1,0 +1,95 @@
+"""kill -9 at random moments: what is on the disk is whole, and the resumed run ends with the same bits."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import random
+import signal
+import time
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import pytest
+
+from sceneexpander.adaptation.loop import StepRecord, adapt
+from sceneexpander.artifacts.store import sha256_of_tensors, write_json_atomic
+from tests.support.tiny_model import TinyReconstructor
+from tests.unit.adaptation.test_loop import FAST, _inputs
+
+STEPS = 40
+KILLS = 20
+
+
+def run_adaptation(folder: Path, steps: Connection) -> None:
+    """A whole adaptation with a resume point after every step, in a process of its own."""
+
+    def on_step(record: StepRecord) -> None:
+        steps.send(record.step)
+
+    config = replace(FAST, steps=STEPS, checkpoint_every=1, observe_every=7)
+    result = adapt(
+        TinyReconstructor(), _inputs(), config, seed=0, checkpoint_folder=folder / "checkpoint", on_step=on_step
+    )
+    hashes = {"student": sha256_of_tensors(result.student), "teacher": sha256_of_tensors(result.teacher)}
+    log = {"records": list(result.records), "looks": list(result.looks)}
+    write_json_atomic(folder / "done.json", {**hashes, **log})
+
+
+@pytest.fixture(scope="module")
+def context() -> multiprocessing.context.ForkServerContext:
+    """Processes that start with the libraries loaded: twenty starts would otherwise take a minute."""
+    made = multiprocessing.get_context("forkserver")
+    made.set_forkserver_preload([__name__])
+    return made
+
+
+def _start(context: multiprocessing.context.ForkServerContext, folder: Path) -> tuple[BaseProcess, Connection]:
+    folder.mkdir(exist_ok=True)
+    reader, writer = context.Pipe(duplex=False)
+    process = context.Process(target=run_adaptation, args=(folder, writer))
+    process.start()
+    writer.close()
+    return process, reader
+
+
+def _steps_until_the_end(reader: Connection) -> list[int]:
+    steps = []
+    try:
+        while True:
+            steps.append(reader.recv())
+    except EOFError:
+        return steps
+
+
+def test_kill_9_at_random_moments_changes_nothing(
+    context: multiprocessing.context.ForkServerContext, tmp_path: Path
+) -> None:
+    process, reader = _start(context, tmp_path / "unbroken")
+    assert _steps_until_the_end(reader) == list(range(1, STEPS + 1))
+    process.join(60)
+    broken, draw = tmp_path / "broken", random.Random(3)  # noqa: S311 - when to kill is no secret
+    reached = []
+    for _ in range(KILLS):
+        process, reader = _start(context, broken)
+        first = reader.recv()  # it runs: the clock starts here
+        time.sleep(draw.uniform(0, 0.15))
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGKILL)
+        steps = [first, *_steps_until_the_end(reader)]
+        process.join(60)
+        reached.append(steps[-1])
+        checkpoint = broken / "checkpoint"
+        if checkpoint.exists():
+            assert {path.name for path in checkpoint.iterdir()} == {"artifact.json", "tensors.safetensors"}
+        if (broken / "done.json").exists():
+            break
+    assert len(set(reached)) > 1, "the kills must come at different steps"
+    process, reader = _start(context, broken)
+    _steps_until_the_end(reader)
+    process.join(60)
+    assert process.exitcode == 0
+    assert {path.name for path in broken.iterdir()} == {"checkpoint", "done.json"}, "no leftovers of killed writers"
+    assert (broken / "done.json").read_bytes() == (tmp_path / "unbroken" / "done.json").read_bytes()
