@@ -73,18 +73,22 @@ def resident(key: str) -> int:
     raise RuntimeError(f"/proc/self/status has no {key}")
 
 
-def measure(case: Case) -> int:
-    """Peak bytes of this process over its state before the model."""
-    # Memory that is freed must leave the process, or the peak would be that of the allocator's habits.
+def return_freed_memory() -> None:
+    """Let freed memory leave the process, or peaks would be those of the allocator's habits."""
     libc = ctypes.CDLL("libc.so.6")
     libc.mallopt(-3, 64 * 1024)  # M_MMAP_THRESHOLD
     libc.mallopt(-1, 64 * 1024)  # M_TRIM_THRESHOLD
+
+
+def measure(case: Case) -> int:
+    """Peak bytes of this process over its state before the model."""
+    return_freed_memory()
     torch.manual_seed(0)
     # A small run of the same kind first: pages of the libraries are not memory of the step.
     small = "mini" if case.model == "mini" else "worldmirror/tiny"
     run_steps(replace(case, model=small, height=56, width=56))
     gc.collect()
-    libc.malloc_trim(0)
+    ctypes.CDLL("libc.so.6").malloc_trim(0)
     before = resident("VmRSS")
     return run_steps(case) - before
 

@@ -70,6 +70,14 @@ class MomentsForm(StrEnum):
     INT8 = "int8"
 
 
+class Trainable(StrEnum):
+    """Which weights adapt: all, as in the paper; the heads alone; or low-rank changes of the trunk's linear layers (LoRA)."""
+
+    ALL = "all"
+    HEADS = "heads"
+    LORA = "lora"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineConfig:
     """How the steps are computed, not what: memory against time. Only ``moments: int8`` changes results beyond rounding."""
@@ -83,6 +91,18 @@ class EngineConfig:
     def __post_init__(self) -> None:
         if self.views_per_chunk < 0:
             raise ValueError(f"adapt.engine.views_per_chunk must be >= 0, is {self.views_per_chunk}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlateauConfig:
+    """Stop early once the loss no longer falls: see `sceneexpander.adaptation.plateau`."""
+
+    window: int = 0  # steps that are averaged; 0: never stop early
+    tolerance: float = 0.02  # least relative fall from one window to the next
+
+    def __post_init__(self) -> None:
+        if self.window < 0 or not 0 <= self.tolerance < 1:
+            raise ValueError("adapt.plateau: window must be >= 0 and tolerance in [0, 1)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,6 +169,9 @@ class AdaptConfig:
     warp_targets: bool = False  # move the anchors of a warped view with its pixels
     precision: Precision = Precision.FP32
     checkpoint_every: int = 25  # steps between resume points; 0: none
+    trainable: Trainable = Trainable.ALL
+    lora_rank: int = 8  # of the changes, if trainable is lora
+    plateau: PlateauConfig = field(default_factory=PlateauConfig)
     observe_every: int = 50  # steps between looks, see `sceneexpander.adaptation.observe`; 0: none
     engine: EngineConfig = field(default_factory=EngineConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
@@ -161,6 +184,7 @@ class AdaptConfig:
             (0 <= self.ema_momentum < 1, f"ema_momentum must be in [0, 1), is {self.ema_momentum}"),
             (0 <= self.restore_rate <= 1, f"restore_rate must be in [0, 1], is {self.restore_rate}"),
             (self.restore_interval >= 0, f"restore_interval must be >= 0, is {self.restore_interval}"),
+            (self.lora_rank >= 1, f"lora_rank must be >= 1, is {self.lora_rank}"),
             (self.observe_every >= 0, f"observe_every must be >= 0, is {self.observe_every}"),
             (self.camera_huber > 0, f"camera_huber must be > 0, is {self.camera_huber}"),
             (self.splat_steps >= 0, f"splat_steps must be >= 0, is {self.splat_steps}"),

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from sceneexpander.adaptation import plateau
 from sceneexpander.adaptation.checkpoint import Checkpoint
 from sceneexpander.adaptation.config import AdaptConfig, DriftForm
 from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, run_key
@@ -19,6 +20,7 @@ from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import NonFiniteLoss
 from sceneexpander.adaptation.observe import Look, Observer, warnings_of
 from sceneexpander.adaptation.sampling import sample_batch
+from sceneexpander.adaptation.trainable import plain_state, trained_parts
 from sceneexpander.models.protocol import Reconstructor, as_module
 
 _log = logging.getLogger(__name__)
@@ -53,6 +55,7 @@ class AdaptationResult:
     teacher: dict[str, Tensor]
     records: tuple[StepRecord, ...]
     looks: tuple[Look, ...]
+    steps_saved: int  # by stopping early
     seconds: float
 
 
@@ -83,28 +86,20 @@ def adapt(
         NonFiniteLoss: a loss term or the gradient is not finite.
     """
     key = run_key(model, inputs, config, seed)
-    run = Run(model, inputs, config, seed)
-    observer = Observer(run.learner, run.source, looks_folder)
     log = RunLog(on_step=on_step, on_look=on_look)
-    if checkpoint_folder is not None and (saved := Checkpoint.load(checkpoint_folder, key)) is not None:
-        run.resume(saved, log)
-        _log.info("resumed the adaptation after step %d", saved.step)
     started = time.perf_counter()
-    for step in range(len(log.records), config.steps + 1):
-        if step > len(log.records):
-            log.add(run.step(step))
-        if _look_due(step, config) and step not in {look.step for look in log.looks}:
-            log.add(observer.look(step))
-        due = config.checkpoint_every and step and step % config.checkpoint_every == 0 and step < config.steps
-        if checkpoint_folder is not None and due:
-            run.checkpoint(key, step, log).save(checkpoint_folder)
+    with trained_parts(model, config, seed=seed):
+        run = Run(model, inputs, config, seed)
+        run.go(log, Observer(run.learner, run.source, looks_folder), key, checkpoint_folder)
+        student, teacher = _on_host(run.learner.model), _on_host(run.learner.teacher)
     for warning in warnings_of(log.looks):
         _log.warning("%s", warning)
     return AdaptationResult(
-        student=_on_host(run.learner.model),
-        teacher=_on_host(run.learner.teacher),
+        student=student,
+        teacher=teacher,
         records=tuple(log.records),
         looks=tuple(log.looks),
+        steps_saved=config.steps - len(log.records),
         seconds=time.perf_counter() - started,
     )
 
@@ -122,6 +117,11 @@ class RunLog:
         self.records: list[StepRecord] = []
         self.looks: list[Look] = []
         self.on_step, self.on_look = on_step, on_look
+
+    @property
+    def looked_at(self) -> set[int]:
+        """Steps that have been looked at."""
+        return {look.step for look in self.looks}
 
     def add(self, entry: StepRecord | Look) -> None:
         """Keep an entry and pass it on."""
@@ -147,6 +147,25 @@ class Run:
         )
         self.learner = Learner(model, anchors, config, seed=seed)
         self.source = ViewSource(model, inputs, config, seed=seed)
+
+    def go(self, log: RunLog, observer: Observer, key: str, checkpoint_folder: Path | None) -> None:
+        """All steps that are left, with their looks and resume points."""
+        config = self.config
+        if checkpoint_folder is not None and (saved := Checkpoint.load(checkpoint_folder, key)) is not None:
+            self.resume(saved, log)
+            _log.info("resumed the adaptation after step %d", saved.step)
+        for step in range(len(log.records), config.steps + 1):
+            if step > len(log.records):
+                log.add(self.step(step))
+            stop = plateau.reached(log.records, config)
+            if (_look_due(step, config) or (stop and config.observe_every)) and step not in log.looked_at:
+                log.add(observer.look(step))
+            if stop and step < config.steps:
+                _log.info("the losses no longer fall: stopped after step %d of %d", step, config.steps)
+                return
+            due = config.checkpoint_every and step and step % config.checkpoint_every == 0 and step < config.steps
+            if checkpoint_folder is not None and due:
+                self.checkpoint(key, step, log).save(checkpoint_folder)
 
     def step(self, step: int) -> StepRecord:
         """One pass of the loop body of Algorithm 1."""
@@ -191,4 +210,5 @@ class Run:
 
 
 def _on_host(model: Reconstructor) -> dict[str, Tensor]:
-    return {name: value.detach().to("cpu", copy=True) for name, value in as_module(model).state_dict().items()}
+    state = plain_state(as_module(model))
+    return {name: value.detach().to("cpu", copy=True) for name, value in state.items()}

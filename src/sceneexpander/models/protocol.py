@@ -121,6 +121,13 @@ class SavesMemory(Protocol):
         ...
 
 
+@runtime_checkable
+class HasTrunk(Protocol):
+    """A reconstructor that says which of its parameters come before the heads."""
+
+    trunk_prefixes: tuple[str, ...]  # of their names
+
+
 def as_module(model: object) -> nn.Module:
     """The same object, seen as the module it is."""
     if not isinstance(model, nn.Module):

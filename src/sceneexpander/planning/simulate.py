@@ -17,7 +17,7 @@ from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.ledger import BUCKET_ELEMENTS
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.sampling import Batch, subset_sizes
-from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor, as_module
+from sceneexpander.models.protocol import ALL_HEADS, Head, Reconstructor, as_module
 from sceneexpander.planning.cost import Cost, Meter
 
 FLOAT_BYTES = 4
@@ -34,7 +34,7 @@ class PlanRequest:
         height: of the images, in pixels.
         width: of the images, in pixels.
         config: of the adaptation.
-        resident_anchor: a third copy of the weights stays in memory, to make the anchors anew in every step.
+        resident_anchor: a third copy of the weights stays in memory: the frozen model that made the anchors.
         all_heads: student and teacher run every head, whether a loss reads it or not.
         gpu: plan for a GPU: weights in large buckets, theta_0 in host memory if the configuration says so.
     """
@@ -77,7 +77,7 @@ def adaptation_cost(request: PlanRequest) -> StepCost:
     seen = step_views(request.views, config)
     with _fake(), Meter() as meter:
         model = request.build()
-        anchor_model = request.build() if request.resident_anchor else None
+        anchor_model = request.build() if request.resident_anchor else None  # only there
         learner = Learner(
             model,
             _anchors(request),
@@ -89,14 +89,12 @@ def adaptation_cost(request: PlanRequest) -> StepCost:
         counts = []
         for step, inserted in ((1, False), (2, True)):
             before = meter.flops
-            if anchor_model is not None:
-                with torch.no_grad(), autocast(config, learner.device):
-                    anchor_model.predict(images[:-1], heads=GEOMETRY_HEADS)
             batch = Batch(captured=tuple(range(seen - 1)), inserted=inserted)
             views = _step_views(request, model, images[: seen if inserted else seen - 1])
             learner.losses(views, batch).objective.backward()  # type: ignore[no-untyped-call]
             learner.ledger.apply(step)
             counts.append(meter.flops - before)
+        del anchor_model
         start = FLOAT_BYTES * learner.ledger.adapted
         on_host = start if request.gpu and config.engine.start_on_host else 0
         share = config.insertion_probability

@@ -41,6 +41,7 @@ class Mini(nn.Module):
     name = "mini"
     size_multiple = SIZE_MULTIPLE
     requires_priors = True
+    trunk_prefixes = ("network.stem.", "network.trunk.", "network.camera_token", "network.register_token")
 
     def __init__(self, config: MiniConfig | None = None) -> None:
         super().__init__()

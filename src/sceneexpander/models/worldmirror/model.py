@@ -69,6 +69,7 @@ class WorldMirror(BackboneModel):
     """The feed-forward reconstructor of worldmirror spec 1; parameter names are those of the public checkpoint."""
 
     name = "worldmirror"
+    trunk_prefixes = ("visual_geometry_transformer.",)
     config: WorldMirrorConfig
 
     def __init__(self, config: WorldMirrorConfig, *, checkpoint_activations: bool = False) -> None:
