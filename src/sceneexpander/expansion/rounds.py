@@ -160,7 +160,15 @@ def adapt_round(
     """Algorithm 1, then the expanded scene with the adapted weights: the state that the next round starts from."""
     priors = realigned_priors(inputs, loaded, config.realign, seed=seed)
     weights, result = adapted_weights(
-        inputs, priors, loaded, config, seed=seed, checkpoint_folder=checkpoint_folder, on_step=on_step
+        inputs,
+        priors,
+        loaded,
+        config,
+        seed=seed,
+        checkpoint_folder=checkpoint_folder,
+        on_step=on_step,
+        on_look=on_look,
+        looks_folder=looks_folder,
     )
     return *finished_round(inputs, priors, weights, loaded, config, seed=seed), result
 
@@ -174,6 +182,8 @@ def adapted_weights(
     seed: int,
     checkpoint_folder: Path | None = None,
     on_step: Callable[[StepRecord], None] | None = None,
+    on_look: Callable[[Look], None] | None = None,
+    looks_folder: Path | None = None,
 ) -> tuple[WeightsChange, AdaptationResult]:
     """Algorithm 1 with the given priors of all views (see `realigned_priors`)."""
     state = inputs.state

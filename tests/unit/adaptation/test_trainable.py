@@ -101,7 +101,6 @@ def _record(step: int, anchor: float, gen: float | None, captured: int = 3) -> S
         gen_camera=gen or 0.0,
         gen_depth=0.0,
         gen_normal=0.0,
-        splat=0.0,
         drift=0.0,
         gradient_norm=0.0,
         restored=0,
