@@ -24,6 +24,7 @@ def _round(scene: str, number: int, methods: list[str]) -> RoundSource:
                 renders=layout.renders(scene, number, method),
                 splats=layout.packed(scene, number, method),
                 metrics=layout.metrics(scene, number, method),
+                report=layout.reconstruction(scene, number, method).parent / "report.json",
             )
             for method in methods
         ],

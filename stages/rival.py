@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import load_priors
-from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.files import read_sections
 from sceneexpander.inference.rivals import RivalsConfig, reconstruct_rival
+from sceneexpander.models.registry import licence_of
 from stages import layout
 from stages.runner import Cell, left_out, stage, use_threads
 
@@ -36,6 +38,8 @@ def main(cell: Cell) -> None:
     made = reconstruct_rival(cell.method, sections.rivals.of(cell.method), views, priors, device=sections.device)
     with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
         made.save(folder / "reconstruction")
+        if isinstance(made, Reconstruction):
+            write_json_atomic(folder / "report.json", {"licence": licence_of(cell.method)})
 
 
 if __name__ == "__main__":

@@ -356,4 +356,5 @@ def test_rivals_are_rows_like_any_other_and_say_so_when_they_cannot_be(finished:
     assert numbers["gaussian_splatting"]["gaussians"] <= 3000, "what it started from, thinned, and its growth"
     assert "OmniVGGT, pixel-aligned" in page
     assert "needs the public checkpoint" in page
+    assert "Livioni/OmniVGGT" in page, "whose weights they are"
     assert len([line for line in table.splitlines() if line.startswith("| ")]) == 2 + 7

@@ -111,6 +111,11 @@ _BUILDERS = {
 }
 
 
+def licence_of(name: str) -> str:
+    """What a report says about using the weights of a reconstructor that `build_reconstructor` knows."""
+    return _BUILDERS[name].licence
+
+
 def reconstructor_names() -> tuple[str, ...]:
     """The names that `build_reconstructor` knows."""
     return tuple(_BUILDERS)

@@ -41,13 +41,14 @@ _LOSSES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MethodSource:
-    """Artefacts of one method in one round."""
+    """Artefacts of one method in one round. ``report``: what its reconstructor says about itself, if it has one of its own."""
 
     name: str
     reconstruction: Path
     renders: Path
     splats: Path
     metrics: Path
+    report: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,6 +231,9 @@ def _method(source: MethodSource, folder: Path, base: str) -> dict[str, Any]:
         "name": source.name,
         "model": reconstruction.model,
         "weights_sha256": reconstruction.weights_sha256,
+        "licence": read_json(source.report)["licence"]
+        if source.report is not None and source.report.is_file()
+        else None,
         "views": [
             {"id": view, "generated": bool(generated), "posed": bool(posed)}
             for view, generated, posed in zip(

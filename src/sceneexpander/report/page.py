@@ -139,6 +139,7 @@ def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Reconstructor", str(model["model"])),
         ("Weights", f"{config['model']['weights']}, sha256 {model['weights_sha256'][:16]}"),
         ("Licence of the weights", str(model["licence"])),
+        *_other_weights(facts),
         ("Seed", str(config["seed"])),
         ("Device", str(config["device"])),
         ("Overrides", ", ".join(facts["overrides"]) or "none"),
@@ -156,6 +157,15 @@ def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
             )
         )
     return rows
+
+
+def _other_weights(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Weights of methods that have a reconstructor of their own, with what their licences say."""
+    others = {m["model"]: m for item in facts["rounds"] for m in item["methods"] if m["licence"] is not None}
+    return [
+        (f"Weights of {model}", f"sha256 {method['weights_sha256'][:16]}; {method['licence']}")
+        for model, method in others.items()
+    ]
 
 
 def _all_statistics(facts: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,10 +11,21 @@ from torch import Tensor
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import Scene
+from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.errors import UserError, entry_point
 from sceneexpander.viewer.live import HOST, LiveViewer
 
-METHODS = ("captured", "backbone", "sceneexpander")  # the last one that exists is shown first
+METHODS = (  # the last one that exists is shown first
+    "omnivggt",
+    "omnivggt_optimised",
+    "ttt3r",
+    "ttt3r_optimised",
+    "gaussian_splatting",
+    "captured",
+    "backbone",
+    "sceneexpander_optimised",
+    "sceneexpander",
+)
 LIMIT = 400_000
 
 
@@ -32,7 +43,7 @@ def load_round(folder: Path, number: int) -> tuple[str, list[Reconstruction], di
         raise UserError("holds no scene", where=folder, fix="run `make repro` first, or name another scene")
     base = folder / f"round_{number}"
     found = [base / method / "reconstruction" for method in METHODS]
-    found = [path for path in found if path.is_dir()]
+    found = [path for path in found if path.is_dir() and unavailable_in(path) is None]
     if not found:
         rounds = sorted(path.name.removeprefix("round_") for path in folder.glob("round_[1-9]*"))
         fix = f"there are rounds {', '.join(rounds)}" if rounds else "run `make repro` first"

@@ -89,6 +89,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
         produce_renders(item, backbone, RenderConfig(frames=5, stills=2), folder / "renders" / name)
         pack_splats(item).save(folder / "packed" / name)
         row(name, 20.0 + index).save(folder / "metrics" / f"{name}.json")
+    write_json_atomic(folder / "backbone" / "report.json", {"licence": "not for resale"})
     for place in (folder, folder / "renders", folder / "packed"):
         LACKING.save(place / "ttt3r")
     UnavailableRow(scene="room", round=1, method="ttt3r", model="ttt3r", seed=0, reason=LACKING.reason).save(
@@ -119,6 +120,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
                         renders=folder / "renders" / name,
                         splats=folder / "packed" / name,
                         metrics=folder / "metrics" / f"{name}.json",
+                        report=folder / name / "report.json",
                     )
                     for name in (*METHODS, "ttt3r")
                 ],
@@ -194,6 +196,7 @@ def test_it_says_what_rows_and_columns_mean_and_what_went_wrong(page: Path) -> N
         assert column.meaning.split(":")[0] in html
     assert "backbone: no camera could be estimated for v2" in html
     assert "is blurred" in html
+    assert "not for resale" in html, "a method with weights of its own says whose they are"
 
 
 def test_a_method_that_could_not_be_run_says_why_where_its_numbers_would_be(page: Path) -> None:
