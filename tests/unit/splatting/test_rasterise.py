@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from sceneexpander.geometry.gaussians import Gaussians, concatenate
 from sceneexpander.geometry.rigid import look_at, quat_wxyz_from_rotation, rigid_inverse, rotation_from_quat_wxyz
-from sceneexpander.splatting import RasterSettings, Render, kernel_backend, rasterise, render, render_normals
-from sceneexpander.splatting.kernel_backend import load_kernel
+from sceneexpander.splatting import rasterise, render, render_normals
+from tests.unit.splatting.backends import (
+    BACKENDS,
+    DIFFERENTIABLE,
+    H,
+    W,
+    assert_same_pictures,
+    needs_kernel,
+    settings,
+)
 from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
-
-H, W = 43, 57  # no multiples of the tile size
-needs_kernel = pytest.mark.skipif(load_kernel() is None, reason="no compiled kernel (no compiler at install)")
-BACKENDS = [pytest.param("cpu", marks=needs_kernel), "torch"]
-DIFFERENTIABLE = ("means", "quat_wxyz", "scales", "opacities", "sh")
-
-
-def settings(backend: str, **changes: object) -> RasterSettings:
-    return RasterSettings(backend=backend, **changes)  # type: ignore[arg-type]
 
 
 def one_gaussian(*, opacity: float = 0.9, sigma: float = 0.1, dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -34,24 +32,6 @@ def one_gaussian(*, opacity: float = 0.9, sigma: float = 0.1, dtype: torch.dtype
         source_view=torch.zeros(1, dtype=torch.long),
         generated=torch.zeros(1, dtype=torch.bool),
     )
-
-
-def assert_same_pictures(a: Render, b: Render, tolerance: float) -> None:
-    for field in fields(Render):
-        # Depth is about 4 and a quotient by alpha, which is 1 - T to 6e-8: five times coarser where alpha is a few per cent.
-        allowed = 5 * tolerance if field.name == "depth" else tolerance
-        torch.testing.assert_close(getattr(a, field.name), getattr(b, field.name), atol=allowed, rtol=0)
-
-
-def gradients(gaussians: Gaussians, world_from_cam: Tensor, chosen: RasterSettings) -> dict[str, Tensor]:
-    leaves = {name: getattr(gaussians, name).detach().clone().requires_grad_() for name in DIFFERENTIABLE}
-    poses = world_from_cam.clone().requires_grad_()
-    picture = render(replace(gaussians, **leaves), poses, intrinsics(len(poses), H, W), H, W, settings=chosen)
-    weights = torch.linspace(-1, 2, W)
-    loss = (picture.rgb**2 * weights).sum() + (picture.alpha * weights).sum() + (picture.generated * weights).sum()
-    # Expected depth of barely covered pixels is a quotient of roundings: only where there is something.
-    (loss + (picture.depth * weights)[picture.alpha > 0.1].sum()).backward()
-    return {name: leaf.grad for name, leaf in leaves.items()} | {"world_from_cam": poses.grad}  # type: ignore[dict-item]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -88,43 +68,6 @@ def test_nearer_gaussians_hide_farther_ones_and_the_background(backend: str) -> 
 
 
 @needs_kernel
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("sh_coefficients", [1, 4, 9, 16])
-def test_kernel_agrees_with_the_torch_oracle(sh_coefficients: int, antialiased: bool) -> None:
-    scene = random_gaussians(400, sh_coefficients=sh_coefficients)
-    poses, k = cameras(2), intrinsics(2, H, W)
-    pictures, slopes = [], []
-    for backend in ("cpu", "torch"):
-        chosen = settings(backend, antialiased=antialiased)
-        pictures.append(render(scene, poses, k, H, W, settings=chosen))
-        slopes.append(gradients(scene, poses, chosen))
-    assert pictures[0].alpha.mean() > 0.2
-    assert_same_pictures(*pictures, tolerance=2e-5)  # the fixtures' tolerance for float32 images
-    for name, expected in slopes[1].items():
-        error = (slopes[0][name] - expected).norm() / expected.norm()
-        assert error < 1e-4, f"{name}: relative L2 {error:.1e}"  # the fixtures' tolerance for float32 gradients
-
-
-@needs_kernel
-@pytest.mark.parametrize("build", ["v3", "v4", "plain"])
-def test_every_build_draws_the_same(build: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    known = kernel_backend.BUILDS.get(torch.backends.cpu.get_cpu_capability(), ("plain",))
-    kernel = kernel_backend.open_build(build) if build in known else None
-    if kernel is None:
-        pytest.skip(f"no {build} here")
-    monkeypatch.setattr(kernel_backend, "load_kernel", lambda: kernel)
-    scene, poses, k = random_gaussians(400, sh_coefficients=9), cameras(2), intrinsics(2, H, W)
-    ours, exact = (render(scene, poses, k, H, W, settings=settings(backend)) for backend in ("cpu", "torch"))
-    assert_same_pictures(ours, exact, tolerance=2e-5)
-    for (name, slope), expected in zip(
-        gradients(scene, poses, settings("cpu")).items(),
-        gradients(scene, poses, settings("torch")).values(),
-        strict=True,
-    ):
-        assert (slope - expected).norm() < 1e-4 * expected.norm(), name
-
-
-@needs_kernel
 def test_kernel_agrees_in_float64_precision_of_the_oracle() -> None:
     scene = random_gaussians(300, seed=3)
     double = replace(scene, **{name: getattr(scene, name).double() for name in DIFFERENTIABLE})
@@ -132,53 +75,6 @@ def test_kernel_agrees_in_float64_precision_of_the_oracle() -> None:
     exact = render(double, poses.double(), k.double(), H, W)
     ours = render(scene, poses, k, H, W, settings=settings("cpu"))
     torch.testing.assert_close(ours.rgb.double(), exact.rgb, atol=2e-5, rtol=0)
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_oracle_gradients_are_those_of_its_images(antialiased: bool) -> None:
-    torch.manual_seed(0)  # gradcheck itself draws
-    scene = random_gaussians(4, seed=1, sh_coefficients=16, dtype=torch.float64)
-    # Wide enough that no pixel is at the 1/255 edge of one of them: finite differences must not cross a decision.
-    scene = replace(scene, scales=scene.scales * 0.3 + 0.8, opacities=scene.opacities * 0.5 + 0.2)
-    view = rigid_inverse(cameras(1, dtype=torch.float64))
-    k = intrinsics(1, 3, 2, dtype=torch.float64)
-    features = torch.linspace(-1, 1, 8, dtype=torch.float64).reshape(1, 4, 2).clone()
-    inputs = [getattr(scene, name) for name in DIFFERENTIABLE] + [view, features, torch.zeros(1, 4, 2).double()]
-
-    def images(*tensors: Tensor) -> tuple[Tensor, ...]:
-        *gaussian, camera, extra, offsets = tensors
-        bottom = camera.new_tensor([[[0.0, 0.0, 0.0, 1.0]]])  # the bottom row is constant
-        camera = torch.cat([camera[:, :3], bottom], 1)
-        out = rasterise(
-            *gaussian,
-            camera,
-            k,
-            3,
-            2,
-            features=extra,
-            screen_offsets=offsets,
-            settings=settings("torch", antialiased=antialiased),
-        )
-        assert out.depth is not None
-        assert out.features is not None
-        return out.rgb, out.alpha, out.depth, out.features
-
-    assert images(*inputs)[1].min() > 0.1
-    assert torch.autograd.gradcheck(images, [t.detach().clone().requires_grad_() for t in inputs], atol=1e-6)
-
-
-@needs_kernel
-def test_kernel_gradients_do_not_depend_on_threads_or_bands() -> None:
-    scene, poses = random_gaussians(500, seed=2), cameras(2)
-    reference = gradients(scene, poses, settings("cpu", threads=1))
-    for changes in (
-        {"threads": 2},
-        {"threads": 5},
-        {"threads": 1, "band_bytes": 1},
-        {"threads": 3, "band_bytes": 9000},
-    ):
-        for name, value in gradients(scene, poses, settings("cpu", **changes)).items():
-            assert torch.equal(value, reference[name]), f"{name} differs with {changes}"
 
 
 @needs_kernel
