@@ -1,6 +1,7 @@
 """Every loss and its gradient against plain numpy loops in float64."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from sceneexpander.adaptation.config import AdaptConfig, DepthDistance
 from sceneexpander.adaptation.losses import (
+    LossTerms,
     ViewGeometry,
     anchor_loss,
     camera_distance,
@@ -128,3 +130,41 @@ def test_views_are_summed_and_pixels_averaged() -> None:
     whole = float(anchor_loss(student, target, config).total)
     parts = [float(anchor_loss(student.view(v, v + 1), target.view(v, v + 1), config).total) for v in range(VIEWS)]
     assert whole == pytest.approx(sum(parts), rel=1e-12)
+
+
+def _written_out_gradients(
+    student: ViewGeometry, target: ViewGeometry, weight_d: float, weight_n: float, huber: float, kind: DepthDistance
+) -> dict[str, np.ndarray]:
+    """The derivatives of the equations, worked out by hand."""
+    p, q = student.camera_vector.numpy(), target.camera_vector.numpy().copy()
+    q[:, 3:7] *= np.where((p[:, 3:7] * q[:, 3:7]).sum(1, keepdims=True) < 0, -1, 1)
+    camera = np.clip((p - q) / huber, -1, 1) / 9
+    d, e = student.depth.numpy(), target.depth.numpy()
+    if kind is DepthDistance.L1:
+        depth = np.sign(d - e) / (H * W)
+    else:
+        ratio = np.log(d) - np.log(e)
+        mean = ratio.mean((1, 2), keepdims=True)
+        variance = ((ratio - mean) ** 2).mean((1, 2), keepdims=True)
+        depth = (ratio - mean) / (H * W * d * np.sqrt(variance + 1e-8))
+    normals = -target.normals.numpy() / (H * W)
+    return {"camera_vector": camera, "depth": weight_d * depth, "normals": weight_n * normals}
+
+
+@pytest.mark.parametrize("kind", list(DepthDistance))
+@pytest.mark.parametrize("huber", [1.0, 0.3])
+@pytest.mark.parametrize("loss", [anchor_loss, generation_loss])
+def test_every_gradient_equals_the_one_worked_out_by_hand(
+    loss: Callable[..., LossTerms], huber: float, kind: DepthDistance
+) -> None:
+    config = AdaptConfig(
+        camera_huber=huber, alpha_depth=0.2, alpha_normal=0.3, beta_depth=1.1, beta_normal=0.7, depth_distance=kind
+    )
+    weight_d, weight_n = (0.2, 0.3) if loss is anchor_loss else (1.1, 0.7)
+    student, target = _geometry(20), _geometry(21)
+    leaves = {
+        name: getattr(student, name).clone().requires_grad_(True) for name in ("camera_vector", "depth", "normals")
+    }
+    loss(ViewGeometry(**leaves), target, config).total.backward()
+    for name, expected in _written_out_gradients(student, target, weight_d, weight_n, huber, kind).items():
+        np.testing.assert_allclose(leaves[name].grad.numpy(), expected, rtol=1e-11, atol=1e-14)
