@@ -103,12 +103,8 @@ def main() -> None:
         folder = Path(name)
         shown = reconstruction()
         (folder / "renders").mkdir()
-        begin = time.perf_counter()
-        produce_renders(shown, shown, RenderConfig(frames=args.frames), folder / "renders")
-        spent = time.perf_counter() - begin
-        print(
-            f"{args.frames} frames of {len(shown.gaussians)} Gaussians at {WIDTH}x{HEIGHT}: {spent:.1f} s", flush=True
-        )
+        spent = timed(lambda: produce_renders(shown, shown, RenderConfig(frames=args.frames), folder / "renders"))
+        print(f"{args.frames} frames of {len(shown.gaussians)} Gaussians at {WIDTH}x{HEIGHT}: {spent}", flush=True)
         for path in sorted((folder / "renders").glob("*.mp4")):
             print(f"  {path.name}: {path.stat().st_size / 1e6:.1f} MB")
         for coefficients in (1, 16):

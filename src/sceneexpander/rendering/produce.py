@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -41,16 +41,10 @@ def produce_renders(
 ) -> Renders:
     """Fill ``folder`` and return what is in it. Arguments as in `plan_tour`; ``on_frame`` hears how many frames are done."""
     tour = plan_tour(reconstruction, reference, config)
-    see = _Eye(reconstruction, config, device)
-    (folder / "stills").mkdir()
-    (folder / "views").mkdir()
-    stills = _film(tour, see, config, folder, on_frame)
-    views = []
-    height, width = reconstruction.depth.shape[1:]
-    for index, view in enumerate(reconstruction.view_ids):
-        seen = see(reconstruction.world_from_cam[index], reconstruction.intrinsics_px[index], height, width)
-        views.append((view, f"views/{view}.png"))
-        save_png(folder / "views" / f"{view}.png", seen.rgb[0])
+    with _one_torch_thread() as threads:
+        see = _Eye(reconstruction, config, device, threads)
+        stills = _film(tour, see, config, folder, on_frame)
+        views = _see_again(reconstruction, see, folder)
     write_ply(reconstruction.gaussians, folder / "gaussians.ply")
     if config.spz:
         cut = write_spz(reconstruction.gaussians, folder / "gaussians.spz")
@@ -65,7 +59,7 @@ def produce_renders(
         width=tour.width,
         videos={name: f"{name}.mp4" for name in LAYERS},
         stills=stills,
-        views=tuple(views),
+        views=views,
         inserted_frame=tour.inserted_frame,
         inserted_camera=tour.inserted_camera,
         gaussians=len(reconstruction.gaussians),
@@ -77,13 +71,30 @@ def produce_renders(
     return renders
 
 
+@contextlib.contextmanager
+def _one_torch_thread() -> Iterator[int]:
+    """Gives the number of threads that torch had, and leaves it one.
+
+    The rasteriser and the encoders have threads of their own. What torch does in between is small, and its team, which spins while it
+    waits, multiplies the time of a video on a machine that has other work.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield threads
+    finally:
+        torch.set_num_threads(threads)
+
+
 class _Eye:
     """Renders one reconstruction."""
 
-    def __init__(self, reconstruction: Reconstruction, config: RenderConfig, device: torch.device | str) -> None:
+    def __init__(
+        self, reconstruction: Reconstruction, config: RenderConfig, device: torch.device | str, threads: int
+    ) -> None:
         self._gaussians = reconstruction.gaussians.to(device)
         self._background = torch.full((3,), config.background, device=device)
-        self._settings = RasterSettings(antialiased=config.antialiased)
+        self._settings = RasterSettings(antialiased=config.antialiased, threads=threads)
         self._device = device
 
     def __call__(self, pose: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], height: int, width: int) -> Render:
@@ -98,10 +109,23 @@ class _Eye:
         )
 
 
+def _see_again(reconstruction: Reconstruction, see: _Eye, folder: Path) -> tuple[tuple[str, str], ...]:
+    """Every view rendered at its own camera: (view, picture)."""
+    (folder / "views").mkdir()
+    height, width = reconstruction.depth.shape[1:]
+    views = []
+    for index, view in enumerate(reconstruction.view_ids):
+        seen = see(reconstruction.world_from_cam[index], reconstruction.intrinsics_px[index], height, width)
+        views.append((view, f"views/{view}.png"))
+        save_png(folder / "views" / f"{view}.png", seen.rgb[0])
+    return tuple(views)
+
+
 def _film(
     tour: Tour, see: _Eye, config: RenderConfig, folder: Path, on_frame: Callable[[int], None] | None
 ) -> tuple[tuple[int, dict[str, str]], ...]:
     """Render and encode frame by frame; only the depths are kept, because their colours need the range of the whole video."""
+    (folder / "stills").mkdir()
     kept = _stills(len(tour.world_from_cam), tour.inserted_frame, config.stills)
     names = {index: {layer: f"stills/{layer}_{index:04d}.png" for layer in LAYERS} for index in kept}
     depths: list[Float[Tensor, "height width"]] = []
