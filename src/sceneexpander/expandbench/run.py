@@ -138,7 +138,7 @@ class _Worker:
         self._loaded: LoadedModel | None = None
         self._prepared: PreparedScene | None = None
         self._cases: dict[str, PreparedCase] = {}
-        self._last: tuple[tuple[str, AdaptConfig, int], tuple[Priors, WeightsChange, float]] | None = None
+        self._last: tuple[tuple[str, AdaptConfig, int], tuple[Priors, WeightsChange, float, int]] | None = None
 
     def cell(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult | None:
         """The cell's result, kept or new; None if it is not there and nothing is to be run."""
@@ -168,10 +168,10 @@ class _Worker:
             case = self.case(grade)
             reconstruction = case.backbone
         if config is not None and case is not None:
-            priors, weights, seconds = self._adapted(grade, case, config, seed)
+            priors, weights, seconds, steps = self._adapted(grade, case, config, seed)
             started = time.perf_counter()
             state, reconstruction = finished_round(case.inputs, priors, weights, self.loaded, config, seed=seed)
-            seconds, steps = seconds + time.perf_counter() - started, config.steps
+            seconds += time.perf_counter() - started
             before = case.inputs.state
             without = reconstruct(before.views, before.priors, self.loaded, state.weights, method="alone")
             alone = self._numbers(without, None)
@@ -190,15 +190,15 @@ class _Worker:
 
     def _adapted(
         self, grade: str, case: PreparedCase, config: AdaptConfig, seed: int
-    ) -> tuple[Priors, WeightsChange, float]:
-        """(priors, weights, seconds) of Algorithm 1 alone, so that rows that differ in what follows it share it. The last one is kept."""
+    ) -> tuple[Priors, WeightsChange, float, int]:
+        """(priors, weights, seconds, steps) of Algorithm 1 alone: rows that differ in what follows it share it. The last one is kept."""
         shared = replace(config, trust=False, splat_steps=0)
         key = grade, shared, seed
         if self._last is None or self._last[0] != key:
             started = time.perf_counter()
             priors = realigned_priors(case.inputs, self.loaded, config.realign, seed=seed)
-            weights, _ = adapted_weights(case.inputs, priors, self.loaded, config, seed=seed)
-            self._last = key, (priors, weights, time.perf_counter() - started)
+            weights, result = adapted_weights(case.inputs, priors, self.loaded, config, seed=seed)
+            self._last = key, (priors, weights, time.perf_counter() - started, len(result.records))
         return self._last[1]
 
     def _numbers(self, reconstruction: Reconstruction, case: PreparedCase | None) -> BenchNumbers:
