@@ -5,14 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneexpander.artifacts.inserted import InsertedView
-from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable, unavailable_in
-from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.files import read_sections
 from sceneexpander.optimisation.config import OptimiseConfig
-from sceneexpander.optimisation.optimise import optimise, unusable
 from sceneexpander.progress import progress_bar
 from stages import layout
 from stages.runner import Cell, checkpoint_folder, left_out, remove_folder, run_identity, stage, use_threads
@@ -30,6 +26,12 @@ class Sections:
 
 def optimise_from(cell: Cell, start: str) -> None:
     """Make the cell's method from the method ``start``, or write down why it cannot be."""
+    # Not at the top: most runs ask for no optimisation, and torch takes seconds to import.
+    from sceneexpander.artifacts.inserted import InsertedView
+    from sceneexpander.artifacts.reconstruction import Reconstruction
+    from sceneexpander.artifacts.views import ViewSet
+    from sceneexpander.optimisation.optimise import optimise, unusable
+
     sections = read_sections(layout.config(cell.scene), Sections)
     use_threads(sections.threads)
     made = layout.reconstruction(cell.scene, cell.round, start)

@@ -4,14 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.inserted import InsertedView
-from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.state import load_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
-from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.files import read_sections
-from sceneexpander.inference.rivals import RivalsConfig, reconstruct_rival
-from sceneexpander.models.registry import licence_of
+from sceneexpander.inference.config import RivalsConfig
 from stages import layout
 from stages.runner import Cell, left_out, stage, use_threads
 
@@ -30,6 +25,14 @@ def main(cell: Cell) -> None:
     """Reconstruct all views with the rival's own weights, or write down why it cannot be."""
     if left_out(cell):
         return
+    # Only now: most runs ask for no rival, and torch takes seconds to import.
+    from sceneexpander.artifacts.inserted import InsertedView
+    from sceneexpander.artifacts.reconstruction import Reconstruction
+    from sceneexpander.artifacts.state import load_priors
+    from sceneexpander.artifacts.views import ViewSet
+    from sceneexpander.inference.rivals import reconstruct_rival
+    from sceneexpander.models.registry import licence_of
+
     sections = read_sections(layout.config(cell.scene), Sections)
     use_threads(sections.threads)
     before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")

@@ -13,7 +13,7 @@ from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.expansion import ModelConfig, load_model
 from sceneexpander.generation import generate_inserted_view
-from sceneexpander.inference.rivals import RivalsConfig
+from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
 
 

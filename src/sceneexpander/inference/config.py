@@ -1,0 +1,43 @@
+"""How the reconstructors of others are run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sceneexpander.errors import UserError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RivalConfig:
+    """How another reconstructor is run.
+
+    ``weights`` are a .safetensors path or a hub id with revision; without them the method's row says that they are needed.
+    ``priors``: what it is told besides the pictures, nothing or the geometric front-end's cameras and depth.
+    """
+
+    variant: str = "default"
+    weights: str | None = None
+    allow_download: bool = False
+    priors: Literal["none", "front_end"] = "none"
+    long_side_px: int = 518  # of the pictures it is given
+
+    def __post_init__(self) -> None:
+        if self.long_side_px < 1:
+            raise UserError(f"must be at least 1, is {self.long_side_px}", where="long_side_px")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RivalsConfig:
+    """One section per reconstructor, under the name of its method."""
+
+    omnivggt: RivalConfig
+    ttt3r: RivalConfig
+
+    def __post_init__(self) -> None:
+        if self.ttt3r.priors != "none":
+            raise UserError("reads no priors", where="ttt3r", fix="use priors=none")
+
+    def of(self, method: str) -> RivalConfig:
+        """The section of a method."""
+        return {"omnivggt": self.omnivggt, "ttt3r": self.ttt3r}[method]
