@@ -19,8 +19,8 @@ TARGET = Path(__file__).parents[1] / "docs" / "memory_table.md"
 HEAD = """# Memory and operations by number of views
 
 Written by `python scripts/memory_table.py`; do not edit. `worldmirror/large` (1263 M parameters), 518 x 518 pixels. GB are 10^9 bytes
-of tensors on the GPU at most, TFLOP those of an average step. `gpu24` is `profile=gpu24`, `paper` the plain way: see
-[memory.md](memory.md).
+of tensors on the GPU at most, TFLOP those of an average step or of a reconstruction with all heads. `gpu24` is `profile=gpu24`, `paper`
+the plain way: see [memory.md](memory.md).
 
 """
 
@@ -28,14 +28,17 @@ of tensors on the GPU at most, TFLOP those of an average step. `gpu24` is `profi
 @entry_point
 def main() -> None:
     """Simulate and write."""
-    columns = " | ".join(f"GB, {options} | TFLOP, {options}" for options in OPTIONS)
-    lines = [f"| views | most in a step | {columns} | GB, reconstruction | TFLOP, reconstruction |"]
-    lines.append("|" + "---|" * (4 + 2 * len(OPTIONS)))
+    columns = " | ".join(f"GB, {options}" for options in OPTIONS)
+    lines = [
+        f"| views | most in a step | {columns} | TFLOP, {OPTIONS[0]} | GB, reconstruction | TFLOP, reconstruction |"
+    ]
+    lines.append("|" + "---|" * (5 + len(OPTIONS)))
     for views in VIEWS:
         plans = [answer(replace(Question(views=views), options=options)) for options in OPTIONS]
-        cells = [f"{plan['peak_gb']:.1f} | {plan['flops_per_step'] / 1e12:.0f}" for plan in plans]
         first = plans[0]
-        cells += [f"{first['inference_peak_gb']:.1f} | {first['inference_flops'] / 1e12:.0f}"]
+        cells = [f"{plan['peak_gb']:.1f}" for plan in plans]
+        cells += [f"{first['flops_per_step'] / 1e12:.0f}", f"{first['inference_peak_gb']:.1f}"]
+        cells += [f"{first['inference_flops'] / 1e12:.0f}"]
         lines.append(f"| {views} | {first['step_views']} | {' | '.join(cells)} |")
         print(lines[-1], file=sys.stderr, flush=True)
     write_bytes_atomic(TARGET, (HEAD + "\n".join(lines) + "\n").encode())

@@ -172,7 +172,7 @@ class AdaptConfig:
     trainable: Trainable = Trainable.ALL
     lora_rank: int = 8  # of the changes, if trainable is lora
     plateau: PlateauConfig = field(default_factory=PlateauConfig)
-    observe_every: int = 50  # steps between looks, see `sceneexpander.adaptation.observe`; 0: none
+    observe_every: int = 60  # steps between looks, see `sceneexpander.adaptation.observe`; 0: none
     engine: EngineConfig = field(default_factory=EngineConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
 
