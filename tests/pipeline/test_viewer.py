@@ -20,7 +20,7 @@ from sceneexpander.geometry.camera import camera_vector_from_pose, unproject_to_
 from sceneexpander.geometry.gaussians import Gaussians, concatenate, sh_from_rgb
 from sceneexpander.geometry.rigid import look_at, quat_wxyz_from_rotation
 from sceneexpander.splatting import render
-from sceneexpander.splatting.video import tint_generated
+from sceneexpander.splatting.video import tint_generated, write_video
 from sceneexpander.viewer.live import HOST, LiveViewer
 from sceneexpander.viewer.packed import pack_splats
 from sceneexpander.viewer.page import ShownMethod, viewer_page
@@ -154,6 +154,23 @@ def test_the_page_asks_nobody_and_complains_about_nothing(tab: Page, html: Path,
     tab.value("$('compare').click()")
     tab.wait("state.method.name === 'backbone'")
     assert tab.messages == []
+
+
+def test_videos_play(tab: Page, tmp_path: Path) -> None:
+    colours = torch.linspace(0.2, 0.9, 12)
+    write_video((torch.full((3, 48, 64), float(c)) for c in colours), tmp_path / "tour.mp4", 24)
+    page = tmp_path / "page.html"
+    page.write_text("<body style='margin:0'><video muted src='tour.mp4' style='display:block'></video>")
+    tab.open(f"file://{page}", 64, 48)
+    video = "document.querySelector('video')"
+    tab.wait(f"{video}.readyState >= 2 || {video}.error")
+    assert tab.value(f"{video}.error && {video}.error.message") is None
+    assert tab.value(f"[{video}.videoWidth, {video}.videoHeight]") == [64, 48]
+    assert tab.value(f"{video}.duration") == pytest.approx(0.5, abs=0.05)
+    tab.value(f"{video}.play()")
+    tab.wait(f"{video}.ended")
+    shown = float(tab.screenshot().mean())
+    assert shown == pytest.approx(0.9, abs=0.03), "its last frame, in the colours that were given"
 
 
 def test_the_live_viewer_shows_what_we_render(tab: Page, tmp_path: Path) -> None:
