@@ -10,7 +10,7 @@ export MLFLOW_DISABLE_TELEMETRY := true
 export MLFLOW_SERVER_ENABLE_JOB_EXECUTION := false
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: repro test test-all test-unit test-conformance test-pipeline lint setup ui view expand ablation mini-scores clean help
+.PHONY: repro test test-unit test-conformance test-pipeline lint setup ui view expand ablation mini-scores clean help
 
 help: ## What there is
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -30,9 +30,7 @@ setup: .venv/.stamp ## Make .venv from requirements.lock
 	$(PY) -m pip install --quiet --no-compile --no-deps --no-build-isolation -e .
 	touch $@
 
-test: lint test-unit test-conformance ## Style, types, unit and conformance tests
-
-test-all: test test-pipeline ## The same, then the whole pipeline end to end (many minutes)
+test: lint test-unit test-conformance test-pipeline ## Style, types, unit and conformance tests, the pipeline end to end
 
 lint: .venv/.stamp ## Style and types
 	ruff check .
@@ -46,7 +44,7 @@ test-conformance: .venv/.stamp
 	pytest tests/conformance
 
 test-pipeline: .venv/.stamp
-	pytest tests/pipeline
+	OMP_NUM_THREADS=1 pytest tests/pipeline -n 2 --dist loadfile
 
 ui: .venv/.stamp ## Runs in the browser (loopback only)
 	$(PY) -m sceneexpander.ui
