@@ -20,7 +20,14 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.evaluation import EvaluateConfig, evaluate
-from sceneexpander.expansion import RoundInputs, adapt_round, captured_prediction, initial_state, joint_reconstruction
+from sceneexpander.expansion import (
+    RoundInputs,
+    adapt_round,
+    captured_prediction,
+    initial_state,
+    joint_reconstruction,
+    refined,
+)
 from sceneexpander.expansion.loaded import load_model
 from sceneexpander.generation import generate_inserted_view
 from sceneexpander.ingest import load_scene
@@ -60,6 +67,8 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
     priors, backbone, _ = joint_reconstruction(state, inserted, loaded, config.frontend, seed=config.seed)
     inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
     views = state.views.append(inserted.view)
+    captured, _ = refined(captured, state.views, config.refine, doubt_generated=True, seed=config.seed)
+    backbone, _ = refined(backbone, views, config.refine, doubt_generated=False, seed=config.seed)
     print(
         f"{scene.name}: {len(state.views)} photos of {views.height} x {views.width}, inserted view posed: {bool(backbone.posed[-1])}"
     )
@@ -70,6 +79,7 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
         adapt: AdaptConfig = replace(composed(row, overrides).adapt, checkpoint_every=0)
         for seed in seeds:
             _, reconstruction, _ = adapt_round(inputs, loaded, adapt, seed=seed)
+            reconstruction, _ = refined(reconstruction, views, config.refine, doubt_generated=adapt.trust, seed=seed)
             print(line(f"{row} seed {seed}", reconstruction, views), flush=True)
         made[row] = reconstruction
     if out is not None:

@@ -15,7 +15,8 @@ from sceneexpander.artifacts.live import LiveLog
 from sceneexpander.artifacts.state import ExpansionState, load_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, judge_round, load_model
+from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, judge_round, load_model, refined
+from sceneexpander.optimisation.refine import RefineConfig
 from sceneexpander.progress import progress_bar
 from stages import layout
 from stages.runner import Cell, checkpoint_folder, live_folder, remove_folder, run_identity, stage, use_threads
@@ -34,6 +35,7 @@ class Sections:
     threads: int
     model: ModelConfig
     adapt: AdaptConfig
+    refine: RefineConfig
 
 
 @stage("scene", "round", "previous")
@@ -81,10 +83,22 @@ def main(cell: Cell) -> None:
             on_look=on_look,
             looks_folder=live / LOOKS,
         )
+    with progress_bar(f"refine {cell.scene} round {cell.round}", sections.refine.steps) as bar:
+        reconstruction, fit = refined(
+            reconstruction,
+            state.views,
+            sections.refine,
+            doubt_generated=sections.adapt.trust,
+            seed=sections.seed,
+            device=sections.device,
+            on_step=lambda step, loss: bar.update(step, loss),
+        )
     warnings = warnings_of(result.looks)
     with directory_being_written(layout.state(cell.scene, cell.round)) as folder:
         state.save(folder)
         reconstruction.save(folder / "reconstruction")
+        if fit is not None:
+            write_json_atomic(folder / layout.REFINEMENT, fit)
         if verdict is not None:
             write_json_atomic(folder / "acceptance.json", verdict)
         write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])

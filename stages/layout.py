@@ -14,6 +14,7 @@ RIVALS = ("omnivggt", "ttt3r")  # networks of others
 SPLATTED = "gaussian_splatting"  # per-scene optimisation, started from the backbone
 OPTIMISABLE = ("sceneexpander", *RIVALS)  # what an optimisation after the fact can start from
 REPEATS = "repeat_*"
+REFINEMENT = "refinement.json"  # beside a reconstruction whose Gaussians were refined: what it changed
 METHODS = (*OURS, SPLATTED, *RIVALS, *(f"{method}_optimised" for method in OPTIMISABLE))
 
 

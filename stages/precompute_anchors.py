@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.state import ExpansionState
-from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, captured_prediction, load_model
+from sceneexpander.expansion import ModelConfig, captured_prediction, load_model, refined
+from sceneexpander.optimisation.refine import RefineConfig
 from stages import layout
 from stages.runner import Cell, stage, use_threads
 
@@ -16,9 +17,11 @@ from stages.runner import Cell, stage, use_threads
 class Sections:
     """What this stage reads of the configuration."""
 
+    seed: int
     device: str
     threads: int
     model: ModelConfig
+    refine: RefineConfig
 
 
 @stage("scene", "round", "previous")
@@ -28,10 +31,20 @@ def main(cell: Cell) -> None:
     use_threads(sections.threads)
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
     anchors, reconstruction = captured_prediction(state, load_model(sections.model, sections.device))
+    reconstruction, fit = refined(
+        reconstruction,
+        state.views,
+        sections.refine,
+        doubt_generated=True,
+        seed=sections.seed,
+        device=sections.device,
+    )
     with directory_being_written(layout.anchors(cell.scene, cell.round)) as folder:
         anchors.save(folder)
     with directory_being_written(layout.reconstruction(cell.scene, cell.round, "captured").parent) as folder:
         reconstruction.save(folder / "reconstruction")
+        if fit is not None:
+            write_json_atomic(folder / layout.REFINEMENT, fit)
 
 
 if __name__ == "__main__":

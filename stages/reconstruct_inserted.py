@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.state import ExpansionState, save_priors
-from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_model
+from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_model, refined
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.optimisation.refine import RefineConfig
 from stages import layout
 from stages.runner import Cell, stage, use_threads
 
@@ -23,6 +24,7 @@ class Sections:
     threads: int
     model: ModelConfig
     frontend: FrontendConfig
+    refine: RefineConfig
 
 
 @stage("scene", "round", "previous")
@@ -34,10 +36,20 @@ def main(cell: Cell) -> None:
     inserted = InsertedView.load(layout.inserted(cell.scene, cell.round))
     loaded = load_model(sections.model, sections.device)
     priors, reconstruction, _ = joint_reconstruction(state, inserted, loaded, sections.frontend, seed=sections.seed)
+    reconstruction, fit = refined(
+        reconstruction,
+        state.views.append(inserted.view),
+        sections.refine,
+        doubt_generated=False,
+        seed=sections.seed,
+        device=sections.device,
+    )
     with directory_being_written(layout.joint_priors(cell.scene, cell.round)) as folder:
         save_priors(folder, priors)
     with directory_being_written(layout.reconstruction(cell.scene, cell.round, "backbone").parent) as folder:
         reconstruction.save(folder / "reconstruction")
+        if fit is not None:
+            write_json_atomic(folder / layout.REFINEMENT, fit)
 
 
 if __name__ == "__main__":

@@ -106,6 +106,7 @@ def main() -> None:
         model=shared.model,
         frontend=shared.frontend,
         warmup=shared.warmup,
+        refine=shared.refine,
         cache=project / ".cache" / "expandbench",
         code=code_of(project),
         any_code=options.any_code,

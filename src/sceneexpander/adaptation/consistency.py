@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import unproject_to_world
-from sceneexpander.geometry.gaussians import SH_DC, Gaussians
+from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
 from sceneexpander.geometry.rigid import rigid_inverse, transform_points
 from sceneexpander.models.protocol import Prediction
 from sceneexpander.splatting import render
@@ -117,16 +117,51 @@ def trust_factors(
     captured, made = ~generated, gaussians.generated
     if not bool(made.any()) or not bool(captured.any()):
         return None
-    points = gaussians.means[made]
     cameras = world_from_cam[captured], intrinsics_px[captured]
-    found = agreement(points, depth[captured], *cameras)
-    colours = gaussians.sh[made, 0] * SH_DC + 0.5
-    off = colour_difference(points, colours, images[captured], depth[captured], *cameras)
-    agrees = found.weight * torch.where(found.seen, torch.exp(-((off / SAME_COLOUR) ** 2) / 2), 1.0)
+    agrees = _agrees(
+        gaussians.means[made], rgb_from_sh(gaussians.sh[made, 0]), images[captured], depth[captured], *cameras
+    )
     filled = _filled_by_captured(gaussians, world_from_cam, intrinsics_px, generated, *depth.shape[1:])
     factors = torch.ones_like(gaussians.opacities)
     factors[made] = 1 - filled * (1 - agrees)
     return factors
+
+
+@torch.no_grad()
+def pixel_trust(
+    reconstruction: Reconstruction, images: Float[Tensor, "view 3 height width"]
+) -> Float[Tensor, "view height width"]:
+    """How far to believe each pixel of each picture: 1 in captured views and where no captured view sees what a generated one shows.
+
+    Elsewhere in generated views it falls with the difference to the captured view that agrees best, in place and in colour.
+    """
+    depth, generated = reconstruction.depth, reconstruction.generated
+    poses, intrinsics = reconstruction.world_from_cam, reconstruction.intrinsics_px
+    trust, captured = torch.ones_like(depth), ~generated
+    if not bool(captured.any()):
+        return trust
+    cameras = poses[captured], intrinsics[captured]
+    for view in torch.nonzero(generated)[:, 0].tolist():
+        one = slice(view, view + 1)
+        points = unproject_to_world(depth[one], intrinsics[one], poses[one]).reshape(-1, 3)
+        colours = images[view].flatten(1).T
+        trust[view] = _agrees(points, colours, images[captured], depth[captured], *cameras).view_as(depth[view])
+    return trust
+
+
+def _agrees(
+    points_world: Float[Tensor, "point 3"],
+    colours: Float[Tensor, "point 3"],
+    captured_images: Float[Tensor, "view 3 height width"],
+    captured_depth: Float[Tensor, "view height width"],
+    captured_world_from_cam: Float[Tensor, "view 4 4"],
+    captured_intrinsics_px: Float[Tensor, "view 3 3"],
+) -> Float[Tensor, "point"]:
+    """1 where nothing contradicts a coloured point, falling to 0 as captured views see another place or colour there."""
+    cameras = captured_world_from_cam, captured_intrinsics_px
+    found = agreement(points_world, captured_depth, *cameras)
+    off = colour_difference(points_world, colours, captured_images, captured_depth, *cameras)
+    return found.weight * torch.where(found.seen, torch.exp(-((off / SAME_COLOUR) ** 2) / 2), 1.0)
 
 
 def _filled_by_captured(

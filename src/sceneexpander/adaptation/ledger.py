@@ -93,6 +93,8 @@ class WeightLedger:
         self.bucket_elements = bucket_elements or BUCKET_ELEMENTS.get(self.device.type, BUCKET_ELEMENTS["cuda"])
         self.buckets: list[Bucket] = []
         self.pending = set(self.parameters)
+        for parameter in self.parameters.values():
+            parameter.grad = None  # one left over from other training would take its parameter in
 
     @property
     def adapted(self) -> int:

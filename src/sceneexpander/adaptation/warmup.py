@@ -110,6 +110,7 @@ def warm_up(
         schedule.step()
         if on_step is not None:
             on_step(step + 1, float(loss.detach()))
+    optimiser.zero_grad(set_to_none=True)
     after = _held_out_error(model, images, priors, hidden, config)
     accepted = after < before
     if not accepted:

@@ -14,6 +14,7 @@ from sceneexpander.generation import GeneratorConfig
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
 from sceneexpander.optimisation.config import OptimiseConfig
+from sceneexpander.optimisation.refine import RefineConfig
 from sceneexpander.rendering import RenderConfig
 from sceneexpander.tracking import TrackingConfig
 
@@ -31,6 +32,7 @@ class ProjectConfig:
     frontend: FrontendConfig
     warmup: WarmupConfig
     adapt: AdaptConfig
+    refine: RefineConfig
     rivals: RivalsConfig
     optimise: OptimiseConfig
     render: RenderConfig

@@ -19,11 +19,12 @@ from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.evaluation.truth import SceneTruth
 from sceneexpander.expandbench.grades import Grade
 from sceneexpander.expandbench.scenes import BenchScene
-from sceneexpander.expansion import LoadedModel, RoundInputs, captured_prediction, initial_state
+from sceneexpander.expansion import LoadedModel, RoundInputs, captured_prediction, initial_state, refined
 from sceneexpander.expansion.rounds import reconstruct, views_priors
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.similarity import align_poses
+from sceneexpander.optimisation.refine import RefineConfig
 
 SEED = 0  # of the front-end and the warm-up: the same pre-insertion scene for every row and seed
 
@@ -48,7 +49,12 @@ class PreparedCase:
 
 
 def prepare_scene(
-    scene: BenchScene, loaded: LoadedModel, frontend: FrontendConfig, warmup: WarmupConfig, cache: Path
+    scene: BenchScene,
+    loaded: LoadedModel,
+    frontend: FrontendConfig,
+    warmup: WarmupConfig,
+    refine: RefineConfig,
+    cache: Path,
 ) -> PreparedScene:
     """The pre-insertion scene, from ``cache`` (a folder of this scene, model and configuration) if it is there."""
     folder = cache / "captured"
@@ -56,6 +62,7 @@ def prepare_scene(
         whole = Scene(name=scene.name, views=scene.captured, rounds=(RoundSpec(prompt="see more"),))
         state, _, _, _ = initial_state(whole, loaded, frontend, warmup, seed=SEED)
         anchors, reconstruction = captured_prediction(state, loaded)
+        reconstruction, _ = refined(reconstruction, state.views, refine, doubt_generated=True, seed=SEED)
         with directory_being_written(folder) as scratch:
             state.save(scratch / "state")
             anchors.save(scratch / "anchors")
@@ -73,6 +80,7 @@ def prepare_case(
     grade: Grade,
     loaded: LoadedModel,
     frontend: FrontendConfig,
+    refine: RefineConfig,
     cache: Path,
 ) -> PreparedCase:
     """The scene with a view of the given grade inserted, from ``cache`` (the scene's folder) if it is there."""
@@ -85,6 +93,7 @@ def prepare_case(
         known = _intended_cameras(scene, prepared) if grade.told else None
         priors, _ = views_priors(views, loaded, frontend, seed=SEED, known=known)
         backbone = reconstruct(views, priors, loaded, prepared.state.weights, method="backbone")
+        backbone, _ = refined(backbone, views, refine, doubt_generated=False, seed=SEED)
         with directory_being_written(folder) as scratch:
             save_priors(scratch / "priors", priors)
             backbone.save(scratch / "backbone")

@@ -20,14 +20,16 @@ from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import WeightsChange
 from sceneexpander.artifacts.store import read_json, to_plain, write_json_atomic
+from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.measure import BenchNumbers, measure
 from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.scenes import BenchScene, build_scene
-from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model
+from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model, refined
 from sceneexpander.expansion.rounds import adapted_weights, finished_round, realigned_priors, reconstruct
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.priors import Priors
+from sceneexpander.optimisation.refine import RefineConfig
 
 CAPTURED = "captured"  # the pre-insertion scene: the ceiling of preservation
 BASELINE = "baseline"  # the same weights given the inserted view
@@ -41,6 +43,7 @@ class Settings:
     model: ModelConfig
     frontend: FrontendConfig
     warmup: WarmupConfig
+    refine: RefineConfig
     cache: Path
     code: str = ""
     any_code: bool = False
@@ -130,7 +133,7 @@ class _Worker:
 
     def __init__(self, name: str, settings: Settings) -> None:
         self.name, self.settings = name, settings
-        shared = {"model": settings.model, "frontend": settings.frontend, "warmup": settings.warmup}
+        shared = {name: getattr(settings, name) for name in ("model", "frontend", "warmup", "refine")}
         self.shared = json.dumps(to_plain(shared), sort_keys=True)
         key = hashlib.sha256(f"{self.shared}:{settings.code if not settings.any_code else ''}".encode()).hexdigest()
         self.folder = settings.cache / "prepared" / key[:16] / name
@@ -171,10 +174,11 @@ class _Worker:
             priors, weights, seconds, steps = self._adapted(grade, case, config, seed)
             started = time.perf_counter()
             state, reconstruction = finished_round(case.inputs, priors, weights, self.loaded, config, seed=seed)
+            reconstruction = self._refined(reconstruction, state.views, config, seed)
             seconds += time.perf_counter() - started
             before = case.inputs.state
             without = reconstruct(before.views, before.priors, self.loaded, state.weights, method="alone")
-            alone = self._numbers(without, None)
+            alone = self._numbers(self._refined(without, before.views, config, seed), None)
         return CellResult(
             scene=self.name,
             grade=grade,
@@ -187,6 +191,11 @@ class _Worker:
             alone=alone,
             candidate=judge_round(case.inputs) if case is not None and row == BASELINE else None,
         )
+
+    def _refined(
+        self, reconstruction: Reconstruction, views: ViewSet, config: AdaptConfig, seed: int
+    ) -> Reconstruction:
+        return refined(reconstruction, views, self.settings.refine, doubt_generated=config.trust, seed=seed)[0]
 
     def _adapted(
         self, grade: str, case: PreparedCase, config: AdaptConfig, seed: int
@@ -226,15 +235,15 @@ class _Worker:
         """The pre-insertion scene."""
         if self._prepared is None:
             s = self.settings
-            self._prepared = prepare_scene(self.scene, self.loaded, s.frontend, s.warmup, self.folder)
+            self._prepared = prepare_scene(self.scene, self.loaded, s.frontend, s.warmup, s.refine, self.folder)
         return self._prepared
 
     def case(self, grade: str) -> PreparedCase:
         """The scene with a view of that grade inserted."""
         if grade not in self._cases:
-            chosen = grade_named(grade)
+            s, chosen = self.settings, grade_named(grade)
             self._cases[grade] = prepare_case(
-                self.scene, self.prepared, chosen, self.loaded, self.settings.frontend, self.folder
+                self.scene, self.prepared, chosen, self.loaded, s.frontend, s.refine, self.folder
             )
         return self._cases[grade]
 

@@ -8,6 +8,7 @@ from sceneexpander.expansion.rounds import (
     initial_state,
     joint_reconstruction,
     judge_round,
+    refined,
 )
 
 __all__ = [
@@ -21,4 +22,5 @@ __all__ = [
     "joint_reconstruction",
     "judge_round",
     "load_model",
+    "refined",
 ]

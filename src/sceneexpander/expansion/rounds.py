@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sceneexpander.adaptation.acceptance import Acceptance, AcceptanceLimits, judge_candidate
 from sceneexpander.adaptation.config import AdaptConfig, Realign
-from sceneexpander.adaptation.consistency import trusted
+from sceneexpander.adaptation.consistency import pixel_trust, trusted
 from sceneexpander.adaptation.gaussian_head import fit_gaussian_head
 from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, StepRecord, adapt
 from sceneexpander.adaptation.observe import Look
@@ -30,6 +30,7 @@ from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.protocol import Prediction
+from sceneexpander.optimisation.refine import RefineConfig, RefineReport, refine
 from sceneexpander.splatting import render
 
 
@@ -233,6 +234,27 @@ def finished_round(
     reconstruction = reconstruct(views, joint_priors, loaded, weights, method="sceneexpander")
     expanded = ExpansionState(views=views, priors=joint_priors, weights=weights)
     return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction
+
+
+def refined(
+    reconstruction: Reconstruction,
+    views: ViewSet,
+    config: RefineConfig,
+    *,
+    doubt_generated: bool,
+    seed: int,
+    device: torch.device | str = "cpu",
+    on_step: Callable[[int, float], None] | None = None,
+) -> tuple[Reconstruction, RefineReport | None]:
+    """The reconstruction with its Gaussians fitted to the pictures they were made from, see `refine`.
+
+    With ``doubt_generated`` a generated picture is believed where no captured view sees the place or one agrees (`pixel_trust`);
+    otherwise it counts like a photo, as for the baseline, which does not know better.
+    """
+    weights = None
+    if config.steps and doubt_generated and bool(reconstruction.generated.any()):
+        weights = pixel_trust(reconstruction, views.images)
+    return refine(reconstruction, views.images, config, weights=weights, seed=seed, device=device, on_step=on_step)
 
 
 def judge_round(inputs: RoundInputs) -> Acceptance | None:

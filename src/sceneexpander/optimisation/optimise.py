@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.evaluation.image import similarity
+from sceneexpander.evaluation.image import WINDOW, similarity
 from sceneexpander.geometry.camera import camera_vector_from_pose
 from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.randomness import child_generator
@@ -25,6 +25,7 @@ from sceneexpander.optimisation.splats import Splats, thinned
 from sceneexpander.splatting import rasterise, render
 
 FEWEST_VIEWS = 2  # with known cameras: one view alone says nothing about where things are
+_MARGIN = WINDOW // 2  # SSIM's windows lie inside the picture
 _COVERED = 0.5  # alpha above which a pixel's rendered depth means something
 _EXTENT_MARGIN = 1.1
 _LEAST_EXTENT = 0.1  # of the median depth: cameras close together still look at a scene of some size
@@ -220,13 +221,16 @@ class _Run:
 
 
 def photometric_loss(
-    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"], ssim_weight: float
+    image: Float[Tensor, "3 height width"],
+    reference: Float[Tensor, "3 height width"],
+    ssim_weight: float,
+    weights: Float[Tensor, "height width"] | None = None,
 ) -> Float[Tensor, ""]:
-    """(1 - w) mean absolute error + w (1 - SSIM)."""
-    error = (image - reference).abs().mean()
-    if ssim_weight == 0:
-        return error
-    return (1 - ssim_weight) * error + ssim_weight * (1 - similarity(image, reference).mean())
+    """(1 - w) mean absolute error + w (1 - SSIM); each pixel, and each window by its centre, counts as much as ``weights`` says."""
+    error, unlike = (image - reference).abs().mean(0), 1 - similarity(image, reference).mean(0)
+    if weights is not None:
+        error, unlike = error * weights, unlike * weights[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+    return (1 - ssim_weight) * error.mean() + ssim_weight * unlike.mean()
 
 
 def density_control(config: OptimiseConfig, *, extent: float, device: torch.device) -> DensityControl:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from sceneexpander.adaptation.consistency import Agreement, agreement, inserted_weights, trusted
+from sceneexpander.adaptation.consistency import Agreement, agreement, inserted_weights, pixel_trust, trusted
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.models.pixel_aligned import pixel_aligned
@@ -131,3 +131,18 @@ def test_without_generated_views_nothing_changes() -> None:
         gaussians=made.gaussians.select(made.gaussians.source_view == 0),
     )
     assert trusted(alone, images) is alone
+
+
+def believed(factor: float, colour: float) -> torch.Tensor:
+    """Trust in each pixel of the generated picture."""
+    made, images = scene_of_two(factor, colour)
+    trust = pixel_trust(made, images)
+    assert bool((trust[0] == 1).all())
+    return trust[1, 4:-4, 4:-4]
+
+
+def test_pixels_are_believed_where_photos_agree_or_do_not_look() -> None:
+    assert float(believed(1.0, 0.5).min()) > 0.99
+    assert float(believed(1.6, 0.9).min()) == 1.0
+    assert float(believed(0.7, 0.5).max()) < 0.1
+    assert float(believed(1.0, 0.9).max()) < 0.1

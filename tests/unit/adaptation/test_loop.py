@@ -76,6 +76,13 @@ def test_with_p_1_the_inserted_view_matters() -> None:
     assert len({_bits(_run(config, _inputs(inserted_seed=seed))) for seed in (9, 10)}) == 2
 
 
+def test_gradients_left_over_from_other_training_do_nothing() -> None:
+    used = TinyReconstructor()
+    for parameter in used.parameters():  # those of heads that no loss of Algorithm 1 reaches among them
+        parameter.grad = torch.ones_like(parameter)
+    assert _bits(adapt(used, _inputs(), FAST, seed=0)) == _bits(_run())
+
+
 def test_the_anchors_are_not_changed() -> None:
     inputs = _inputs()
     names = ("camera_vector", "depth", "normals", "depth_conf", "normals_conf")

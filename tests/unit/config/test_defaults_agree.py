@@ -12,6 +12,7 @@ from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.inference.config import RivalConfig, RivalsConfig
 from sceneexpander.ingest import IngestConfig
 from sceneexpander.optimisation.config import OptimiseConfig
+from sceneexpander.optimisation.refine import RefineConfig
 from sceneexpander.rendering import RenderConfig
 
 CONF = Path(__file__).parents[3] / "conf"
@@ -25,6 +26,7 @@ CONF = Path(__file__).parents[3] / "conf"
         ("evaluate", EvaluateConfig()),
         ("scene", IngestConfig()),
         ("optimise", OptimiseConfig()),
+        ("refine", RefineConfig()),
         ("rivals", RivalsConfig(omnivggt=RivalConfig(), ttt3r=RivalConfig(long_side_px=512))),
         ("render", RenderConfig()),
     ],

@@ -12,6 +12,7 @@ from sceneexpander.expandbench import run as bench
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings, run
 from sceneexpander.expansion import ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.optimisation.refine import RefineConfig
 from tests.unit.expandbench.test_table import NUMBERS
 
 PLAN = Plan(
@@ -40,8 +41,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
 
 
 def settings(folder: Path, **changes: object) -> Settings:
-    values = {"model": ModelConfig(), "frontend": FrontendConfig(), "warmup": WarmupConfig(), "code": "one"} | changes
-    return Settings(cache=folder, **values)  # type: ignore[arg-type]
+    values = {"model": ModelConfig(), "frontend": FrontendConfig(), "warmup": WarmupConfig(), "refine": RefineConfig()}
+    return Settings(cache=folder, **values | {"code": "one"} | changes)  # type: ignore[arg-type]
 
 
 def test_every_cell_once(tmp_path: Path, measured: list[tuple[str, ...]]) -> None:
@@ -79,6 +80,8 @@ def test_other_code_or_settings_are_measured_again(tmp_path: Path, measured: lis
     assert len(measured) == 2 * count
     run(PLAN, settings(tmp_path, code="two", warmup=WarmupConfig(steps=1)))
     assert len(measured) == 3 * count
+    run(PLAN, settings(tmp_path, code="two", refine=RefineConfig(steps=1)))
+    assert len(measured) == 4 * count
 
 
 def test_a_changed_row_is_measured_again_and_a_renamed_one_is_not(
