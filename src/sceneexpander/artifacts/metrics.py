@@ -22,7 +22,7 @@ class ViewMetrics:
     depth is the rendered one). The ``others_`` columns use
     only Gaussians that came from *other* views, over the pixels that those cover (share ``others_coverage``): a picture that agrees with
     its neighbours scores high, doubled contours (ghosting) score low. ``generated_share`` is the part of alpha that Gaussians
-    of generated views contribute.
+    of generated views contribute. ``st_lpips`` is the shift-tolerant perceptual distance, smaller is better.
     """
 
     view_id: str
@@ -35,6 +35,7 @@ class ViewMetrics:
     depth_disagreement: float | None = None
     others_coverage: float | None = None
     others_psnr_db: float | None = None
+    st_lpips: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +64,7 @@ class MetricsRow:
     Of a method that was run several times with other seeds, the numbers are means over the ``repeats`` and ``spread`` holds their standard
     deviations (n - 1) by name (see `value`); ``views`` are those of the first run.
 
-    ``psnr_db`` and ``ssim`` are over the captured views (preservation), ``inserted_`` over the view inserted in this round.
+    ``psnr_db``, ``ssim`` and ``st_lpips`` are over the captured views (preservation), ``inserted_`` over the view inserted in this round.
     ``navigation_coverage`` is the mean share of covered pixels over the frames of the navigation.
     """
 
@@ -82,8 +83,10 @@ class MetricsRow:
     coverage: float
     depth_disagreement: float | None = None
     others_psnr_db: float | None = None
+    st_lpips: float | None = None
     inserted_psnr_db: float | None = None
     inserted_ssim: float | None = None
+    inserted_st_lpips: float | None = None
     inserted_generated_share: float | None = None
     inserted_others_psnr_db: float | None = None
     navigation_coverage: float | None = None

@@ -16,11 +16,13 @@ class EvaluateConfig:
         coverage_alpha: a pixel counts as covered if its alpha is above this.
         antialiased: render with the antialiased opacity compensation.
         cross_view: also compare each view with what the other views' Gaussians show (one more rendering per view).
+        st_lpips: also the perceptual distance, where the package ``stlpips-pytorch`` is installed.
     """
 
     coverage_alpha: float = 0.5
     antialiased: bool = False
     cross_view: bool = True
+    st_lpips: bool = True
 
     def __post_init__(self) -> None:
         if not 0 < self.coverage_alpha < 1:

@@ -41,9 +41,11 @@ class Column:
 COLUMNS: tuple[Column, ...] = (
     Column(name="psnr_db", title="PSNR", better="↑"),
     Column(name="ssim", title="SSIM", better="↑", digits=3),
+    Column(name="st_lpips", title="ST-LPIPS", better="↓", digits=4),
     Column(name="others_psnr_db", title="cross-view PSNR", better="↑"),
     Column(name="inserted_psnr_db", title="insertion PSNR", better="↑", expansion=True),
     Column(name="inserted_ssim", title="insertion SSIM", better="↑", digits=3, expansion=True),
+    Column(name="inserted_st_lpips", title="insertion ST-LPIPS", better="↓", digits=4, expansion=True),
     Column(name="navigation_coverage", title="coverage", better="↑", digits=3),
     Column(name="coverage_gained", title="coverage gained", better="↑", digits=3, expansion=True),
     Column(name="truth.camera_rotation_deg", title="camera rotation °", better="↓"),

@@ -16,6 +16,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import psnr, ssim
+from sceneexpander.evaluation.perceptual import st_lpips
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import align_poses
 from sceneexpander.splatting import Render, render
@@ -126,6 +127,7 @@ def _row(
         depth_disagreement=float(relative.median()) if len(relative) else None,
         others_coverage=others_coverage,
         others_psnr_db=others_psnr,
+        st_lpips=st_lpips(seen.rgb[0], picture) if config.st_lpips else None,
     )
 
 

@@ -25,8 +25,8 @@ _COVERED = 0.5  # alpha from which on a pixel counts as drawn
 class BenchNumbers:
     """Numbers of one reconstruction. None: not defined there (e.g. the inserted view before the insertion).
 
-    Captured region: ``psnr_db``, ``ssim`` and ``others_psnr_db`` as in `MetricsRow`; camera errors between captured views; depth
-    error of the captured views after one common scale. Expanded region, at the *true* intended camera placed in the
+    Captured region: ``psnr_db``, ``ssim``, ``st_lpips`` and ``others_psnr_db`` as in `MetricsRow`; camera errors between captured
+    views; depth error of the captured views after one common scale. Expanded region, at the *true* intended camera placed in the
     reconstruction by the captured cameras, over what no captured view sees: ``new_psnr_db`` against the consistent picture (black
     where nothing is drawn, so missing content costs), ``new_coverage``, and relative error of the rendered depth over
     the drawn pixels. ``between_psnr_db``: the whole picture at a camera half-way there, which no method was given.
@@ -34,6 +34,7 @@ class BenchNumbers:
 
     psnr_db: float
     ssim: float
+    st_lpips: float | None
     others_psnr_db: float | None
     camera_rotation_deg: float | None
     camera_direction_deg: float | None
@@ -77,6 +78,7 @@ def measure(reconstruction: Reconstruction, views: ViewSet, truth: SceneTruth, s
     return BenchNumbers(
         psnr_db=row.psnr_db,
         ssim=row.ssim,
+        st_lpips=row.st_lpips,
         others_psnr_db=row.others_psnr_db,
         camera_rotation_deg=known.camera_rotation_deg,
         camera_direction_deg=known.camera_direction_deg,

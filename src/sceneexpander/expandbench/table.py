@@ -31,6 +31,7 @@ class Column:
 COLUMNS: tuple[Column, ...] = (
     Column(name="psnr_db", title="PSNR ↑"),
     Column(name="ssim", title="SSIM ↑", digits=3),
+    Column(name="st_lpips", title="ST-LPIPS ↓", digits=4, higher=False),
     Column(name="others_psnr_db", title="cross-view PSNR ↑"),
     Column(name="camera_rotation_deg", title="camera ° ↓", higher=False),
     Column(name="depth_abs_rel", title="depth AbsRel ↓", digits=4, higher=False),

@@ -88,6 +88,13 @@ COLUMNS = (
     ),
     Column(name="ssim", label="SSIM", digits=3, better="higher", meaning="The same, structural similarity."),
     Column(
+        name="st_lpips",
+        label="ST-LPIPS",
+        digits=4,
+        better="lower",
+        meaning="The same, shift-tolerant perceptual distance.",
+    ),
+    Column(
         name="others_psnr_db",
         label="PSNR from others, dB",
         better="higher",
@@ -105,6 +112,13 @@ COLUMNS = (
         digits=3,
         better="higher",
         meaning="The same, structural similarity.",
+    ),
+    Column(
+        name="inserted_st_lpips",
+        label="Inserted ST-LPIPS",
+        digits=4,
+        better="lower",
+        meaning="The same, shift-tolerant perceptual distance.",
     ),
     Column(
         name="inserted_others_psnr_db",

@@ -25,7 +25,7 @@ from sceneexpander.expandbench.table import (
 PSNR = COLUMNS[0]
 DEPTH = next(column for column in COLUMNS if column.name == "depth_abs_rel")
 NUMBERS = BenchNumbers(
-    psnr_db=20.0, ssim=0.8, others_psnr_db=19.0, camera_rotation_deg=0.1, camera_direction_deg=0.2, depth_abs_rel=0.05,
+    psnr_db=20.0, ssim=0.8, st_lpips=0.01, others_psnr_db=19.0, camera_rotation_deg=0.1, camera_direction_deg=0.2, depth_abs_rel=0.05,
     inserted_psnr_db=25.0, inserted_rotation_deg=1.0, inserted_direction_deg=2.0, new_psnr_db=15.0, new_coverage=0.9,
     new_depth_abs_rel=0.2, between_psnr_db=17.0,
 )  # fmt: skip

@@ -1,0 +1,63 @@
+"""ST-LPIPS as the package computes it, and without the package."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+
+import pytest
+import torch
+
+from sceneexpander.evaluation import perceptual
+from sceneexpander.evaluation.perceptual import PACKAGE, st_lpips
+
+installed = pytest.mark.skipif(importlib.util.find_spec(PACKAGE) is None, reason="needs stlpips-pytorch")
+
+
+def picture() -> torch.Tensor:
+    """Smooth blobs, 96 x 128."""
+    coarse = torch.rand(1, 3, 12, 16, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.interpolate(coarse, (96, 128), mode="bicubic", align_corners=False)[0].clamp(0, 1)
+
+
+def distance(image: torch.Tensor, reference: torch.Tensor) -> float:
+    value = st_lpips(image, reference)
+    assert value is not None
+    return value
+
+
+@installed
+def test_equal_pictures_have_no_distance_and_worse_ones_more() -> None:
+    image = picture()
+    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
+    assert distance(image, image) == 0
+    slight, strong = (distance(image + s * noise, image) for s in (0.05, 0.2))
+    assert 0 < slight < strong
+
+
+@installed
+def test_a_shift_by_a_pixel_costs_less_than_blur() -> None:
+    """What the metric is for: the squared error says the opposite."""
+    image = picture()
+    shifted = image.roll(1, dims=-1)
+    blurred = torch.nn.functional.avg_pool2d(image, 9, stride=1, padding=4, count_include_pad=False)
+    assert float((shifted - image).square().mean()) > 0.2 * float((blurred - image).square().mean())
+    assert distance(shifted, image) < 0.5 * distance(blurred, image)
+
+
+@installed
+def test_values_outside_a_display_do_not_count_and_no_stand_in_stays() -> None:
+    image = picture()
+    assert distance(image + (image == 1), image) == 0
+    for name in ("torchvision", "IPython", "torchsummary"):
+        module = sys.modules.get(name)
+        assert module is None or module.__spec__ is not None
+
+
+def test_without_the_package_there_is_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: None)
+    perceptual._network.cache_clear()
+    try:
+        assert st_lpips(picture(), picture()) is None
+    finally:
+        perceptual._network.cache_clear()
