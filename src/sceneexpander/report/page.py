@@ -156,6 +156,9 @@ def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
                 f"{warmup['steps']} steps, held-out error {warmup['before']:.4f} to {warmup['after']:.4f}, {outcome}",
             )
         )
+    if config["refine"]["steps"]:
+        steps = config["refine"]["steps"]
+        rows.append(("Gaussians", f"in all rows of this reconstructor fitted to their pictures for {steps} steps"))
     return rows
 
 

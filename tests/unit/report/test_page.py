@@ -128,7 +128,13 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
                 statistics=folder / "stats",
             )
         ],
-        config={"seed": 0, "device": "cpu", "model": {"weights": "builtin"}, "adapt": {"steps": 3}},
+        config={
+            "seed": 0,
+            "device": "cpu",
+            "model": {"weights": "builtin"},
+            "adapt": {"steps": 3},
+            "refine": {"steps": 2},
+        },
         overrides=["profile=smoke"],
     )
 
