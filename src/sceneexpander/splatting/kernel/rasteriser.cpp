@@ -26,6 +26,7 @@
 #include <memory>
 #include <new>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #if defined(__linux__)
@@ -57,6 +58,7 @@ constexpr int kPixels = kTileH / kRows * kStride;
 constexpr int kMoments = 6;        // sums over pixels: v, v dx, v dy, v dx^2, v dx dy, v dy^2
 constexpr int kDoneEvery = 16;     // Gaussians between two tests whether a tile is finished
 constexpr int kAhead = 8;          // Gaussians by which records are fetched ahead: a tile's lie all over memory
+constexpr int kDigitBits = 12;     // most bits of a depth that one pass of the sort takes
 constexpr int kChunk = 2048;       // Gaussians per unit of work; fixed, so that partial sums do not depend on threads
 constexpr float kMinAlpha = 1.0f / 255.0f;
 constexpr float kMinTransmittance = 1e-4f;
@@ -215,8 +217,9 @@ struct SxScene {
   const float* intrinsics;      // [3,3]
 };
 
-// Gradients are added to what the buffers hold.
+// Gradients of what views share are added to what the buffers hold if `add`; all others are set.
 struct SxGradients {
+  int32_t add;
   float *means, *quats, *scales, *opacities, *colours;
   float* extras;          // or null
   float* offsets;         // or null
@@ -408,6 +411,11 @@ struct Rect {
   uint16_t x0, x1, y0, y1;  // in tiles, end exclusive; empty where culled
 };
 
+// How many of a Gaussian's tiles lie in the tile rows row0 to row1 (exclusive).
+SX_INLINE int64_t tiles_in(const Rect& r, int row0, int row1) {
+  return static_cast<int64_t>(r.x1 - r.x0) * std::max(0, std::min<int>(r.y1, row1) - std::max<int>(r.y0, row0));
+}
+
 struct Bins {  // Gaussians of each tile of a band, in depth order
   int row0 = 0, row1 = 0;
   std::vector<uint64_t> start;
@@ -415,11 +423,12 @@ struct Bins {  // Gaussians of each tile of a band, in depth order
 };
 
 struct View {
-  int64_t count = 0;
+  int64_t count = 0, visible = 0;
+  int64_t pairs = 0;  // of a visible Gaussian and a tile
   int tiles_x = 0, tiles_y = 0, channels = 0;
-  Buffer<Rect> rects;  // by Gaussian
-  std::vector<uint32_t> order;    // visible Gaussians by depth
-  std::vector<Rect> ordered_rects;
+  Buffer<Rect> rects;      // by Gaussian
+  Buffer<uint32_t> order;  // visible Gaussians by depth
+  Buffer<Rect> ordered_rects;
   std::vector<int> bands;  // boundaries in tile rows
   Bins bins;               // kept for the backward pass if there is only one band
   virtual ~View() = default;
@@ -457,56 +466,115 @@ bool make_record(const SxScene& s, const Camera& cam, int64_t g, Projection& o, 
   return true;
 }
 
+int64_t chunks_of(int64_t count) { return (count + kChunk - 1) / kChunk; }
+
+// Calls fn(g) for the Gaussians of a chunk.
+template <class Fn>
+SX_INLINE void each_of_chunk(int64_t chunk, int64_t count, const Fn& fn) {
+  for (int64_t g = chunk * kChunk; g < std::min<int64_t>(count, (chunk + 1) * kChunk); ++g) fn(g);
+}
+
+struct DepthKeys {
+  Buffer<uint32_t> key;         // by Gaussian, kCulled where it cannot be seen
+  std::vector<int64_t> before;  // visible Gaussians before each chunk
+  uint32_t least = kCulled, most = 0;
+};
+
+// Also counts what is visible, chunk by chunk, so that nobody has to go through all Gaussians alone.
 template <int NC>
-void project_all(const SxScene& s, const Camera& cam, ViewOf<NC>& view, uint32_t* keys, float* radii) {
-  const int64_t chunks = (s.count + kChunk - 1) / kChunk;
-  parallel_for(s.threads, chunks, [&](int64_t chunk) {
+void project_all(const SxScene& s, const Camera& cam, ViewOf<NC>& view, DepthKeys& keys, float* radii) {
+  struct Count {
+    int64_t visible = 0, pairs = 0;
+    uint32_t least = kCulled, most = 0;
+  };
+  std::vector<Count> counts(chunks_of(s.count));
+  keys.key = uninitialised<uint32_t>(s.count);
+  parallel_for(s.threads, chunks_of(s.count), [&](int64_t chunk) {
     Projection o;
-    for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); ++g) {
+    Count own;
+    each_of_chunk(chunk, s.count, [&](int64_t g) {
       Record<NC>& rec = view.records[g];
-      keys[g] = kCulled;
+      uint32_t& key = keys.key[g];
+      key = kCulled;
       radii[g] = 0.0f;
       view.rects[g] = Rect{0, 0, 0, 0};
-      if (!make_record<NC>(s, cam, g, o, rec, radii[g])) continue;
-      std::memcpy(&keys[g], &o.p[2], sizeof(float));  // positive floats order like their bits
-      view.rects[g] = Rect{static_cast<uint16_t>(rec.x0 / kTileW), static_cast<uint16_t>((rec.x1 - 1) / kTileW + 1),
-                           static_cast<uint16_t>(rec.y0 / kTileH), static_cast<uint16_t>((rec.y1 - 1) / kTileH + 1)};
+      if (!make_record<NC>(s, cam, g, o, rec, radii[g])) return;
+      std::memcpy(&key, &o.p[2], sizeof(float));  // positive floats order like their bits
+      const Rect rect{static_cast<uint16_t>(rec.x0 / kTileW), static_cast<uint16_t>((rec.x1 - 1) / kTileW + 1),
+                      static_cast<uint16_t>(rec.y0 / kTileH), static_cast<uint16_t>((rec.y1 - 1) / kTileH + 1)};
+      view.rects[g] = rect;
+      own.visible += 1, own.pairs += tiles_in(rect, 0, view.tiles_y);
+      own.least = std::min(own.least, key), own.most = std::max(own.most, key);
+    });
+    counts[chunk] = own;
+  });
+  keys.before.reserve(counts.size());
+  for (const Count& part : counts) {
+    keys.before.push_back(view.visible);
+    view.visible += part.visible, view.pairs += part.pairs;
+    keys.least = std::min(keys.least, part.least), keys.most = std::max(keys.most, part.most);
+  }
+}
+
+// Stable radix sort of the visible Gaussians by key, in digits of equal width from the lowest. Each part of the list counts, then
+// writes behind the parts before it: there is only one stable order, so the number of parts does not show.
+void order_by_depth(int threads, const DepthKeys& keys, View& view) {
+  struct Item {
+    uint32_t key, index;
+  };
+  auto items = uninitialised<Item>(view.visible), other = uninitialised<Item>(view.visible);
+  parallel_for(threads, chunks_of(view.count), [&](int64_t chunk) {
+    Item* next = items.get() + keys.before[chunk];
+    each_of_chunk(chunk, view.count, [&](int64_t g) {
+      if (keys.key[g] != kCulled) *next++ = {keys.key[g] - keys.least, static_cast<uint32_t>(g)};
+    });
+  });
+  const uint32_t spread = view.visible > 0 ? keys.most - keys.least : 0;
+  int bits = 0;  // of the spread
+  while (bits < 32 && spread >> bits != 0) ++bits;
+  const int passes = (bits + kDigitBits - 1) / kDigitBits;
+  const int width = passes > 0 ? (bits + passes - 1) / passes : 0;
+  const uint32_t digits = 1u << width;
+  const int64_t parts = std::max(1, threads);
+  auto range = [&](int64_t part) { return part * view.visible / parts; };
+  std::vector<uint32_t> cursor(parts * digits);
+  for (int shift = 0; shift < bits; shift += width) {
+    auto digit = [&](const Item& item) { return item.key >> shift & (digits - 1); };
+    parallel_for(threads, parts, [&](int64_t part) {
+      uint32_t* mine = cursor.data() + part * digits;
+      std::fill(mine, mine + digits, 0);
+      for (int64_t i = range(part); i < range(part + 1); ++i) ++mine[digit(items[i])];
+    });
+    uint32_t total = 0;
+    for (uint32_t d = 0; d < digits; ++d)
+      for (int64_t part = 0; part < parts; ++part) total += std::exchange(cursor[part * digits + d], total);
+    parallel_for(threads, parts, [&](int64_t part) {
+      uint32_t* mine = cursor.data() + part * digits;
+      for (int64_t i = range(part); i < range(part + 1); ++i) other[mine[digit(items[i])]++] = items[i];
+    });
+    items.swap(other);
+  }
+  view.order = uninitialised<uint32_t>(view.visible);
+  view.ordered_rects = uninitialised<Rect>(view.visible);
+  parallel_for(threads, parts, [&](int64_t part) {
+    for (int64_t i = range(part); i < range(part + 1); ++i) {
+      view.order[i] = items[i].index;
+      view.ordered_rects[i] = view.rects[items[i].index];
     }
   });
 }
 
-// Stable radix sort of the visible Gaussians by key, 11 bits at a time; a digit that all keys share costs one count only.
-void order_by_depth(int64_t count, const uint32_t* keys, View& view) {
-  struct Item {
-    uint32_t key, index;
-  };
-  std::vector<Item> items, other;
-  items.reserve(count);
-  for (int64_t g = 0; g < count; ++g)
-    if (keys[g] != kCulled) items.push_back({keys[g], static_cast<uint32_t>(g)});
-  other.resize(items.size());
-  for (int shift = 0; shift < 32; shift += 11) {
-    std::vector<size_t> start(2049, 0);
-    for (const Item& item : items) ++start[((item.key >> shift) & 2047) + 1];
-    if (std::find(start.begin(), start.end(), items.size()) != start.end() && !items.empty()) continue;
-    for (int i = 0; i < 2048; ++i) start[i + 1] += start[i];
-    for (const Item& item : items) other[start[(item.key >> shift) & 2047]++] = item;
-    items.swap(other);
-  }
-  view.order.resize(items.size());
-  view.ordered_rects.resize(items.size());
-  for (size_t i = 0; i < items.size(); ++i) {
-    view.order[i] = items[i].index;
-    view.ordered_rects[i] = view.rects[items[i].index];
-  }
-}
-
 // Greedy bands of whole tile rows, each within the budget where a single row is.
 void choose_bands(const SxScene& s, View& view) {
-  std::vector<int64_t> change(view.tiles_y + 1, 0);
-  for (const Rect& r : view.ordered_rects) change[r.y0] += r.x1 - r.x0, change[r.y1] -= r.x1 - r.x0;
   const int64_t budget = s.band_bytes / static_cast<int64_t>(sizeof(float) * (1 + kMoments + channels_of(s)));
-  view.bands.assign(1, 0);
+  view.bands = {0, view.tiles_y};
+  if (view.pairs <= budget) return;
+  std::vector<int64_t> change(view.tiles_y + 1, 0);
+  for (int64_t i = 0; i < view.visible; ++i) {
+    const Rect& r = view.ordered_rects[i];
+    change[r.y0] += r.x1 - r.x0, change[r.y1] -= r.x1 - r.x0;
+  }
+  view.bands = {0};
   int64_t in_row = 0, in_band = 0;
   for (int row = 0; row < view.tiles_y; ++row) {
     in_row += change[row];
@@ -525,10 +593,9 @@ SX_INLINE void each_tile(const Rect& r, int row0, int row1, int tiles_x, const F
 // Stable counting sort: each part of the depth order counts, then writes behind the parts before it.
 void fill_bins(const View& view, int threads, int row0, int row1, Bins& bins) {
   const int64_t tiles = static_cast<int64_t>(row1 - row0) * view.tiles_x;
-  const int64_t visible = static_cast<int64_t>(view.order.size());
   const int64_t parts = std::max(1, threads);
   std::vector<uint64_t> cursor(parts * tiles, 0);
-  auto range = [&](int64_t part) { return part * visible / parts; };
+  auto range = [&](int64_t part) { return part * view.visible / parts; };
   parallel_for(threads, parts, [&](int64_t part) {
     uint64_t* mine = cursor.data() + part * tiles;
     for (int64_t i = range(part); i < range(part + 1); ++i)
@@ -665,9 +732,9 @@ View* forward(const SxScene& s, float* planes, float* transmittance, float* radi
   view->records = uninitialised<Record<NC>>(s.count);
   view->rects = uninitialised<Rect>(s.count);
   {
-    auto keys = uninitialised<uint32_t>(s.count);
-    project_all<NC>(s, Camera(s), *view, keys.get(), radii);
-    order_by_depth(s.count, keys.get(), *view);
+    DepthKeys keys;
+    project_all<NC>(s, Camera(s), *view, keys, radii);
+    order_by_depth(s.threads, keys, *view);
   }
   choose_bands(s, *view);
   for (size_t band = 0; band + 1 < view->bands.size(); ++band) {
@@ -812,6 +879,17 @@ void shade_backward(const SxScene& s, const Camera& cam, int64_t g, const float*
   for (int i = 0; i < 3; ++i) d_mean[i] = (d_dir[i] - along * dir.d[i]) * dir.inv_length;
 }
 
+void clear_gradients(const SxScene& s, const SxGradients& grad, int64_t chunk) {
+  const int64_t first = chunk * kChunk, rows = std::min<int64_t>(s.count - first, kChunk);
+  auto clear = [&](float* all, int64_t width) {
+    if (all) std::fill_n(all + first * width, rows * width, 0.0f);
+  };
+  clear(grad.extras, s.extra_channels), clear(grad.offsets, 2);
+  if (grad.add) return;
+  clear(grad.means, 3), clear(grad.quats, 4), clear(grad.scales, 3), clear(grad.opacities, 1);
+  clear(grad.colours, 3 * std::max(1, s.sh_coefficients));
+}
+
 // Carries the summed slot of one Gaussian through its projection.
 void project_backward(const SxScene& s, const Camera& cam, int64_t g, const float* sums, const float* colour,
                       const SxGradients& grad, CameraSums& cam_sums) {
@@ -883,18 +961,20 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
   constexpr int kSlot = kMoments + NC;
   auto& view = static_cast<ViewOf<NC>&>(base);
   const bool banded = view.bands.size() > 2;
-  const int64_t chunks = (s.count + kChunk - 1) / kChunk;
+  const int64_t chunks = chunks_of(s.count);
   std::vector<float> carried(banded ? s.count * kSlot : 0, 0.0f);  // sums of the bands so far
-  std::vector<uint64_t> offset(s.count + 1);
+  auto offset = uninitialised<uint64_t>(s.count);                  // of a Gaussian's slots from its chunk's first
+  std::vector<uint64_t> chunk_offset(chunks);
   Buffer<float> slots;
-  auto add_slots = [&](int64_t g, float* sums) {
-    for (uint64_t slot = offset[g]; slot < offset[g + 1]; ++slot)
-      for (int k = 0; k < kSlot; ++k) sums[k] += slots[slot * kSlot + k];
+  auto first_slot = [&](int64_t g) { return slots.get() + (chunk_offset[g / kChunk] + offset[g]) * kSlot; };
+  auto add_slots = [&](int64_t g, int row0, int row1, float* sums) {
+    const float* slot = first_slot(g);
+    for (int64_t n = tiles_in(view.rects[g], row0, row1); n > 0; --n, slot += kSlot)
+      for (int k = 0; k < kSlot; ++k) sums[k] += slot[k];
   };
-  auto each_gaussian = [&](const auto& fn) {
-    parallel_for(s.threads, chunks, [&](int64_t chunk) {
-      for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); ++g)
-        if (view.rects[g].x0 < view.rects[g].x1) fn(g, chunk);
+  auto each_visible = [&](int64_t chunk, const auto& fn) {
+    each_of_chunk(chunk, s.count, [&](int64_t g) {
+      if (view.rects[g].x0 < view.rects[g].x1) fn(g);
     });
   };
 
@@ -903,13 +983,16 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
     Bins refilled;
     if (banded) fill_bins(view, s.threads, row0, row1, refilled);
     const Bins& bins = banded ? refilled : view.bins;
+    parallel_for(s.threads, chunks, [&](int64_t chunk) {
+      uint64_t in_chunk = 0;
+      each_of_chunk(chunk, s.count, [&](int64_t g) {
+        offset[g] = in_chunk;
+        in_chunk += tiles_in(view.rects[g], row0, row1);
+      });
+      chunk_offset[chunk] = in_chunk;
+    });
     uint64_t total = 0;
-    for (int64_t g = 0; g < s.count; ++g) {
-      const Rect& r = view.rects[g];
-      offset[g] = total;
-      total += static_cast<uint64_t>(r.x1 - r.x0) * std::max(0, std::min<int>(r.y1, row1) - std::max<int>(r.y0, row0));
-    }
-    offset[s.count] = total;
+    for (uint64_t& in_chunk : chunk_offset) total += std::exchange(in_chunk, total);
     slots = uninitialised<float>(total * kSlot);
     parallel_for(s.threads, static_cast<int64_t>(row1 - row0) * view.tiles_x, [&](int64_t tile) {
       const int column = static_cast<int>(tile % view.tiles_x), row = row0 + static_cast<int>(tile / view.tiles_x);
@@ -919,25 +1002,32 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
       auto slot_of = [&](uint32_t g) {
         const Rect& r = view.rects[g];
         const uint64_t within = static_cast<uint64_t>(row - std::max<int>(r.y0, row0)) * (r.x1 - r.x0) + column - r.x0;
-        return slots.get() + (offset[g] + within) * kSlot;
+        return first_slot(g) + within * kSlot;
       };
       blend_tile_backward<NC>(s, view.records.get(), bins.entries.get() + bins.start[tile],
                               bins.start[tile + 1] - bins.start[tile], tile_area(s, column, row), up, slot_of, fetch);
     });
-    if (banded) each_gaussian([&](int64_t g, int64_t) { add_slots(g, carried.data() + g * kSlot); });
+    if (!banded) break;
+    parallel_for(s.threads, chunks, [&](int64_t chunk) {
+      each_visible(chunk, [&](int64_t g) { add_slots(g, row0, row1, carried.data() + g * kSlot); });
+    });
   }
 
   const Camera cam(s);
   std::vector<CameraSums> cam_sums(chunks);
-  each_gaussian([&](int64_t g, int64_t chunk) {
-    float own[kSlot] = {};
-    float* sums = own;
-    if (banded)
-      sums = carried.data() + g * kSlot;
-    else
-      add_slots(g, own);
-    project_backward(s, cam, g, sums, view.records[g].feature, grad, cam_sums[chunk]);
+  parallel_for(s.threads, chunks, [&](int64_t chunk) {
+    clear_gradients(s, grad, chunk);  // here rather than all at once: every thread, and rows that stay in its cache
+    each_visible(chunk, [&](int64_t g) {
+      float own[kSlot] = {};
+      float* sums = own;
+      if (banded)
+        sums = carried.data() + g * kSlot;
+      else
+        add_slots(g, 0, view.tiles_y, own);
+      project_backward(s, cam, g, sums, view.records[g].feature, grad, cam_sums[chunk]);
+    });
   });
+  std::fill_n(grad.cam_from_world, 16, 0.0f);
   CameraSums total;
   for (const CameraSums& part : cam_sums) {
     for (int i = 0; i < 9; ++i) total.r[i] += part.r[i];
@@ -963,7 +1053,7 @@ auto with_channels(int channels, const Fn& fn) {
 
 // ------------------------------------------------------------------------------------------------ entry points
 
-SX_API int32_t sx_abi_version() { return 1; }
+SX_API int32_t sx_abi_version() { return 2; }
 SX_API int32_t sx_max_channels() { return 16; }
 
 // Renders planes [channels,H,W], transmittance [H,W] and radii [N] (pixels, 0: not seen). Returns the view's state for
@@ -977,7 +1067,7 @@ SX_API void* sx_forward(const SxScene* scene, float* planes, float* transmittanc
   }
 }
 
-// Adds to `gradients`, given the outputs of sx_forward for the same scene and the loss's gradients. 0, or 1 if memory ran out.
+// Writes `gradients`, given the outputs of sx_forward for the same scene and the loss's gradients. 0, or 1 if memory ran out.
 SX_API int32_t sx_backward(const SxScene* scene, void* state, const float* planes, const float* transmittance,
                            const float* d_planes, const float* d_alpha, const SxGradients* gradients) {
   try {
