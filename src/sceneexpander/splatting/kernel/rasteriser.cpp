@@ -97,6 +97,40 @@ SX_INLINE float lane_sum(Vec v) {
   return lanes[0];
 }
 
+SX_INLINE bool any(Mask mask) {
+  int32_t lanes[kLanes], found = 0;
+  std::memcpy(lanes, &mask, sizeof lanes);
+  for (int32_t lane : lanes) found |= lane;
+  return found != 0;
+}
+template <class Fn>
+SX_INLINE Vec each_lane(Vec v, const Fn& fn) {
+  float lanes[kLanes];
+  store(lanes, v);
+  for (float& lane : lanes) lane = fn(lane);
+  return load(lanes);
+}
+SX_INLINE Vec sqrt_vec(Vec v) {
+  return each_lane(v, [](float x) { return std::sqrt(x); });
+}
+SX_INLINE Vec ceil_vec(Vec v) {
+  return each_lane(v, [](float x) { return std::ceil(x); });
+}
+SX_INLINE Vec floor_vec(Vec v) {
+  return each_lane(v, [](float x) { return std::floor(x); });
+}
+SX_INLINE Vec max_vec(Vec a, Vec b) { return a < b ? b : a; }
+SX_INLINE Vec min_vec(Vec a, Vec b) { return b < a ? b : a; }
+
+// Up to kLanes rows of W floats as W vectors, a row in each lane; zeros in the lanes without a row.
+template <int W>
+SX_INLINE void load_rows(const float* rows, int count, Vec* out) {
+  float columns[W][kLanes] = {};
+  for (int lane = 0; lane < count; ++lane)
+    for (int i = 0; i < W; ++i) columns[i][lane] = rows[lane * W + i];
+  for (int i = 0; i < W; ++i) out[i] = load(columns[i]);
+}
+
 // out[i] = sum of the lanes of v[i]. Eight vectors at a time by adding shuffled pairs, where the compiler has shuffles.
 template <int N>
 SX_INLINE void lane_sums(const Vec* v, float* out) {
@@ -249,55 +283,62 @@ struct Camera {
   }
 };
 
-SX_INLINE float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-// Everything between a Gaussian and its ellipse on the image; the backward pass recomputes it.
-struct Projection {
-  float p[3];                // mean in the camera frame
-  float inv_z, rx, ry;       // 1/z, clamped x/z and y/z
-  bool x_free, y_free;       // not clamped
-  float q[4], inv_norm;      // unit quaternion, 1/length of the given one
-  float rot[9];              // world_from_gaussian
-  float a[9];                // cam_from_gaussian, scaled: R * rot * diag(s)
-  float j00, j02, j11, j12;  // Jacobian
-  float v0[3], v1[3];        // rows of J * a: cov = v v^T
-  float xx, xy, yy;          // covariance before the blur
-  float det0, det1;          // determinants before and after the blur
-  float bx, by;              // diagonal after the blur
-  float compensation;        // of the opacity, antialiased mode
-  float opacity;             // compensated
-  float u, v;                // mean on the image
-};
-
-SX_INLINE void rotation_from_quat(const float* q, float* m) {
-  const float w = q[0], x = q[1], y = q[2], z = q[3];
-  m[0] = 1 - 2 * (y * y + z * z), m[1] = 2 * (x * y - w * z), m[2] = 2 * (x * z + w * y);
-  m[3] = 2 * (x * y + w * z), m[4] = 1 - 2 * (x * x + z * z), m[5] = 2 * (y * z - w * x);
-  m[6] = 2 * (x * z - w * y), m[7] = 2 * (y * z + w * x), m[8] = 1 - 2 * (x * x + y * y);
+template <class A, class B>
+SX_INLINE B dot3(const A* a, const B* b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-// False where the Gaussian cannot be seen. Tests are written so that NaN fails them.
-SX_INLINE bool project(const SxScene& s, const Camera& cam, int64_t g, Projection& o) {
-  const float* m = s.means + 3 * g;
-  for (int i = 0; i < 3; ++i) o.p[i] = dot3(cam.r + 3 * i, m) + cam.t[i];
-  const float z = o.p[2];
-  if (!(z > s.near_plane) || !(z < s.far_plane)) return false;
-  if (!(s.opacities[g] >= kMinAlpha)) return false;
+// Everything between kLanes Gaussians, one per lane, and their ellipses on the image; the backward pass recomputes it.
+struct Projection {
+  Vec m[3], scale[3];      // as given
+  Vec p[3];                // mean in the camera frame
+  Vec inv_z, rx, ry;       // 1/z, clamped x/z and y/z
+  Mask x_free, y_free;     // not clamped
+  Vec q[4], inv_norm;      // unit quaternion, 1/length of the given one
+  Vec rot[9];              // world_from_gaussian
+  Vec a[9];                // cam_from_gaussian, scaled: R * rot * diag(s)
+  Vec j00, j02, j11, j12;  // Jacobian
+  Vec v0[3], v1[3];        // rows of J * a: cov = v v^T
+  Vec xx, xy, yy;          // covariance before the blur
+  Vec det0, det1;          // determinants before and after the blur
+  Vec bx, by;              // diagonal after the blur
+  Vec given_opacity;
+  Vec compensation;        // of the opacity, antialiased mode
+  Vec opacity;             // compensated
+  Vec u, v;                // mean on the image
+};
 
-  const float* q = s.quats + 4 * g;
-  o.inv_norm = 1.0f / std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  for (int i = 0; i < 4; ++i) o.q[i] = q[i] * o.inv_norm;
+SX_INLINE void rotation_from_quat(const Vec* q, Vec* m) {
+  const Vec w = q[0], x = q[1], y = q[2], z = q[3];
+  m[0] = 1.0f - 2.0f * (y * y + z * z), m[1] = 2.0f * (x * y - w * z), m[2] = 2.0f * (x * z + w * y);
+  m[3] = 2.0f * (x * y + w * z), m[4] = 1.0f - 2.0f * (x * x + z * z), m[5] = 2.0f * (y * z - w * x);
+  m[6] = 2.0f * (x * z - w * y), m[7] = 2.0f * (y * z + w * x), m[8] = 1.0f - 2.0f * (x * x + y * y);
+}
+
+// Of the Gaussians from g on, which can be seen; the lanes of others mean nothing. Tests are written so that NaN fails them.
+SX_INLINE Mask project(const SxScene& s, const Camera& cam, int64_t g, Projection& o) {
+  const int n = static_cast<int>(std::min<int64_t>(s.count - g, kLanes));
+  load_rows<3>(s.means + 3 * g, n, o.m);
+  load_rows<1>(s.opacities + g, n, &o.given_opacity);
+  for (int i = 0; i < 3; ++i) o.p[i] = dot3(cam.r + 3 * i, o.m) + cam.t[i];
+  const Vec z = o.p[2];
+  Mask seen = (z > s.near_plane) & (z < s.far_plane) & (o.given_opacity >= kMinAlpha);
+  if (!any(seen)) return seen;
+
+  load_rows<4>(s.quats + 4 * g, n, o.q);
+  o.inv_norm = 1.0f / sqrt_vec(o.q[0] * o.q[0] + o.q[1] * o.q[1] + o.q[2] * o.q[2] + o.q[3] * o.q[3]);
+  for (int i = 0; i < 4; ++i) o.q[i] *= o.inv_norm;
   rotation_from_quat(o.q, o.rot);
-  const float* scale = s.scales + 3 * g;
+  load_rows<3>(s.scales + 3 * g, n, o.scale);
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j)
       o.a[3 * i + j] =
-          (cam.r[3 * i] * o.rot[j] + cam.r[3 * i + 1] * o.rot[3 + j] + cam.r[3 * i + 2] * o.rot[6 + j]) * scale[j];
+          (cam.r[3 * i] * o.rot[j] + cam.r[3 * i + 1] * o.rot[3 + j] + cam.r[3 * i + 2] * o.rot[6 + j]) * o.scale[j];
 
   o.inv_z = 1.0f / z;
-  const float x_ratio = o.p[0] * o.inv_z, y_ratio = o.p[1] * o.inv_z;
-  o.rx = std::min(std::max(x_ratio, cam.x_low), cam.x_high);
-  o.ry = std::min(std::max(y_ratio, cam.y_low), cam.y_high);
+  const Vec x_ratio = o.p[0] * o.inv_z, y_ratio = o.p[1] * o.inv_z;
+  o.rx = min_vec(max_vec(x_ratio, splat(cam.x_low)), splat(cam.x_high));
+  o.ry = min_vec(max_vec(y_ratio, splat(cam.y_low)), splat(cam.y_high));
   o.x_free = o.rx == x_ratio, o.y_free = o.ry == y_ratio;
   o.j00 = cam.fx * o.inv_z, o.j02 = -cam.fx * o.rx * o.inv_z;
   o.j11 = cam.fy * o.inv_z, o.j12 = -cam.fy * o.ry * o.inv_z;
@@ -308,19 +349,22 @@ SX_INLINE bool project(const SxScene& s, const Camera& cam, int64_t g, Projectio
   o.xx = dot3(o.v0, o.v0), o.xy = dot3(o.v0, o.v1), o.yy = dot3(o.v1, o.v1);
   o.bx = o.xx + s.eps2d, o.by = o.yy + s.eps2d;
   // |v0 x v1|^2 cannot turn negative, xx * yy - xy^2 can.
-  const float n0 = o.v0[1] * o.v1[2] - o.v0[2] * o.v1[1];
-  const float n1 = o.v0[2] * o.v1[0] - o.v0[0] * o.v1[2];
-  const float n2 = o.v0[0] * o.v1[1] - o.v0[1] * o.v1[0];
+  const Vec n0 = o.v0[1] * o.v1[2] - o.v0[2] * o.v1[1];
+  const Vec n1 = o.v0[2] * o.v1[0] - o.v0[0] * o.v1[2];
+  const Vec n2 = o.v0[0] * o.v1[1] - o.v0[1] * o.v1[0];
   o.det0 = n0 * n0 + n1 * n1 + n2 * n2;
   o.det1 = o.det0 + s.eps2d * (o.xx + o.yy) + s.eps2d * s.eps2d;
-  if (!(o.det1 > kMinDeterminant)) return false;
 
-  o.compensation = s.antialiased ? std::max(kMinCompensation, std::sqrt(o.det0 / o.det1)) : 1.0f;
-  o.opacity = s.opacities[g] * o.compensation;
-  if (!(o.opacity >= kMinAlpha)) return false;
+  o.compensation = splat(1.0f);
+  if (s.antialiased) o.compensation = max_vec(splat(kMinCompensation), sqrt_vec(o.det0 / o.det1));
+  o.opacity = o.given_opacity * o.compensation;
   o.u = cam.fx * x_ratio + cam.cx, o.v = cam.fy * y_ratio + cam.cy;
-  if (s.offsets) o.u += s.offsets[2 * g], o.v += s.offsets[2 * g + 1];
-  return true;
+  if (s.offsets) {
+    Vec offset[2];
+    load_rows<2>(s.offsets + 2 * g, n, offset);
+    o.u += offset[0], o.v += offset[1];
+  }
+  return seen & (o.det1 > kMinDeterminant) & (o.opacity >= kMinAlpha);
 }
 
 // ------------------------------------------------------------------------------------------------ spherical harmonics
@@ -411,6 +455,8 @@ struct Rect {
   uint16_t x0, x1, y0, y1;  // in tiles, end exclusive; empty where culled
 };
 
+SX_INLINE bool is_seen(const Rect& r) { return r.x0 < r.x1; }
+
 // How many of a Gaussian's tiles lie in the tile rows row0 to row1 (exclusive).
 SX_INLINE int64_t tiles_in(const Rect& r, int row0, int row1) {
   return static_cast<int64_t>(r.x1 - r.x0) * std::max(0, std::min<int>(r.y1, row1) - std::max<int>(r.y0, row0));
@@ -441,31 +487,6 @@ struct ViewOf : View {
 
 int channels_of(const SxScene& s) { return 3 + (s.with_depth ? 1 : 0) + s.extra_channels; }
 
-template <int NC>
-bool make_record(const SxScene& s, const Camera& cam, int64_t g, Projection& o, Record<NC>& rec, float& radius) {
-  if (!project(s, cam, g, o)) return false;
-  // alpha >= 1/255 inside this ellipse only; the margin absorbs rounding.
-  const float extent = 2.0f * std::log(255.0f * o.opacity) + 1e-4f;
-  const float half_w = std::sqrt(extent * o.bx), half_h = std::sqrt(extent * o.by);
-  const float w = static_cast<float>(s.width), h = static_cast<float>(s.height);
-  const float x0 = std::max(std::ceil(o.u - half_w - 0.5f), 0.0f), x1 = std::min(std::floor(o.u + half_w + 0.5f), w);
-  const float y0 = std::max(std::ceil(o.v - half_h - 0.5f), 0.0f), y1 = std::min(std::floor(o.v + half_h + 0.5f), h);
-  if (!(x0 < x1) || !(y0 < y1)) return false;
-  radius = std::max(half_w, half_h);
-  const float k = -0.5f * kLog2E / o.det1;
-  rec.u = o.u, rec.v = o.v;
-  rec.qa = k * o.by, rec.qb = -2.0f * k * o.xy, rec.qc = k * o.bx;
-  rec.level = std::log2(o.opacity);
-  rec.x0 = static_cast<int16_t>(x0), rec.x1 = static_cast<int16_t>(x1);
-  rec.y0 = static_cast<int16_t>(y0), rec.y1 = static_cast<int16_t>(y1);
-  std::fill(rec.feature, rec.feature + NC, 0.0f);
-  shade(s, cam, g, rec.feature);
-  float* rest = rec.feature + 3;
-  if (s.with_depth) *rest++ = o.p[2];
-  if (s.extra_channels) std::copy_n(s.extras + g * s.extra_channels, s.extra_channels, rest);
-  return true;
-}
-
 int64_t chunks_of(int64_t count) { return (count + kChunk - 1) / kChunk; }
 
 // Calls fn(g) for the Gaussians of a chunk.
@@ -480,36 +501,72 @@ struct DepthKeys {
   uint32_t least = kCulled, most = 0;
 };
 
-// Also counts what is visible, chunk by chunk, so that nobody has to go through all Gaussians alone.
+// Of a chunk, so that nobody has to go through all Gaussians alone.
+struct SeenCount {
+  int64_t visible = 0, pairs = 0;
+  uint32_t least = kCulled, most = 0;
+};
+
+// Records, rectangles, depths and radii of the up to kLanes Gaussians from g on.
+template <int NC>
+void make_records(const SxScene& s, const Camera& cam, int64_t g, ViewOf<NC>& view, uint32_t* keys, float* radii,
+                  SeenCount& count) {
+  const int n = static_cast<int>(std::min<int64_t>(s.count - g, kLanes));
+  std::fill_n(keys + g, n, kCulled);
+  std::fill_n(radii + g, n, 0.0f);
+  std::fill_n(view.rects.get() + g, n, Rect{0, 0, 0, 0});
+  Projection o;
+  Mask seen = project(s, cam, g, o);
+  if (!any(seen)) return;
+  // alpha >= 1/255 inside this ellipse only; the margin absorbs rounding.
+  const Vec opacity = seen ? o.opacity : splat(1.0f);  // logarithms of lanes that mean nothing may be slow
+  const Vec extent = 2.0f * each_lane(255.0f * opacity, [](float x) { return std::log(x); }) + 1e-4f;
+  const Vec level = each_lane(opacity, [](float x) { return std::log2(x); });
+  const Vec half_w = sqrt_vec(extent * o.bx), half_h = sqrt_vec(extent * o.by);
+  const Vec w = splat(static_cast<float>(s.width)), h = splat(static_cast<float>(s.height));
+  const Vec x0 = max_vec(ceil_vec(o.u - half_w - 0.5f), Vec{}), x1 = min_vec(floor_vec(o.u + half_w + 0.5f), w);
+  const Vec y0 = max_vec(ceil_vec(o.v - half_h - 0.5f), Vec{}), y1 = min_vec(floor_vec(o.v + half_h + 0.5f), h);
+  seen &= (x0 < x1) & (y0 < y1);
+  const Vec radius = max_vec(half_w, half_h);
+  const Vec k = -0.5f * kLog2E / o.det1;
+  const Vec qa = k * o.by, qb = -2.0f * k * o.xy, qc = k * o.bx;
+  for (int lane = 0; lane < n; ++lane) {
+    if (!seen[lane]) continue;
+    const int64_t at = g + lane;
+    const float z = o.p[2][lane];
+    Record<NC>& rec = view.records[at];
+    rec.u = o.u[lane], rec.v = o.v[lane];
+    rec.qa = qa[lane], rec.qb = qb[lane], rec.qc = qc[lane];
+    rec.level = level[lane];
+    rec.x0 = static_cast<int16_t>(x0[lane]), rec.x1 = static_cast<int16_t>(x1[lane]);
+    rec.y0 = static_cast<int16_t>(y0[lane]), rec.y1 = static_cast<int16_t>(y1[lane]);
+    std::fill(rec.feature, rec.feature + NC, 0.0f);
+    shade(s, cam, at, rec.feature);
+    float* rest = rec.feature + 3;
+    if (s.with_depth) *rest++ = z;
+    if (s.extra_channels) std::copy_n(s.extras + at * s.extra_channels, s.extra_channels, rest);
+    radii[at] = radius[lane];
+    const Rect rect{static_cast<uint16_t>(rec.x0 / kTileW), static_cast<uint16_t>((rec.x1 - 1) / kTileW + 1),
+                    static_cast<uint16_t>(rec.y0 / kTileH), static_cast<uint16_t>((rec.y1 - 1) / kTileH + 1)};
+    view.rects[at] = rect;
+    std::memcpy(&keys[at], &z, sizeof z);  // positive floats order like their bits
+    count.visible += 1, count.pairs += tiles_in(rect, 0, view.tiles_y);
+    count.least = std::min(count.least, keys[at]), count.most = std::max(count.most, keys[at]);
+  }
+}
+
 template <int NC>
 void project_all(const SxScene& s, const Camera& cam, ViewOf<NC>& view, DepthKeys& keys, float* radii) {
-  struct Count {
-    int64_t visible = 0, pairs = 0;
-    uint32_t least = kCulled, most = 0;
-  };
-  std::vector<Count> counts(chunks_of(s.count));
+  std::vector<SeenCount> counts(chunks_of(s.count));
   keys.key = uninitialised<uint32_t>(s.count);
   parallel_for(s.threads, chunks_of(s.count), [&](int64_t chunk) {
-    Projection o;
-    Count own;
-    each_of_chunk(chunk, s.count, [&](int64_t g) {
-      Record<NC>& rec = view.records[g];
-      uint32_t& key = keys.key[g];
-      key = kCulled;
-      radii[g] = 0.0f;
-      view.rects[g] = Rect{0, 0, 0, 0};
-      if (!make_record<NC>(s, cam, g, o, rec, radii[g])) return;
-      std::memcpy(&key, &o.p[2], sizeof(float));  // positive floats order like their bits
-      const Rect rect{static_cast<uint16_t>(rec.x0 / kTileW), static_cast<uint16_t>((rec.x1 - 1) / kTileW + 1),
-                      static_cast<uint16_t>(rec.y0 / kTileH), static_cast<uint16_t>((rec.y1 - 1) / kTileH + 1)};
-      view.rects[g] = rect;
-      own.visible += 1, own.pairs += tiles_in(rect, 0, view.tiles_y);
-      own.least = std::min(own.least, key), own.most = std::max(own.most, key);
-    });
+    SeenCount own;
+    for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); g += kLanes)
+      make_records<NC>(s, cam, g, view, keys.key.get(), radii, own);
     counts[chunk] = own;
   });
   keys.before.reserve(counts.size());
-  for (const Count& part : counts) {
+  for (const SeenCount& part : counts) {
     keys.before.push_back(view.visible);
     view.visible += part.visible, view.pairs += part.pairs;
     keys.least = std::min(keys.least, part.least), keys.most = std::max(keys.most, part.most);
@@ -856,16 +913,16 @@ struct CameraSums {
   double r[9] = {}, t[3] = {};
 };
 
-void quat_backward(const Projection& o, const float* d, float* out) {  // d: dL/d(rotation matrix)
-  const float w = o.q[0], x = o.q[1], y = o.q[2], z = o.q[3];
-  const float dq[4] = {
-      2 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
-      2 * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - 2 * x * (d[4] + d[8])),
-      2 * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2 * y * (d[0] + d[8])),
-      2 * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2 * z * (d[0] + d[4])),
+SX_INLINE void quat_backward(const Projection& o, const Vec* d, Vec* out) {  // d: dL/d(rotation matrix)
+  const Vec w = o.q[0], x = o.q[1], y = o.q[2], z = o.q[3];
+  const Vec dq[4] = {
+      2.0f * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
+      2.0f * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - 2.0f * x * (d[4] + d[8])),
+      2.0f * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2.0f * y * (d[0] + d[8])),
+      2.0f * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2.0f * z * (d[0] + d[4])),
   };
-  const float along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;  // the length of a quaternion has no effect
-  for (int i = 0; i < 4; ++i) out[i] += (dq[i] - along * o.q[i]) * o.inv_norm;
+  const Vec along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;  // the length of a quaternion has no effect
+  for (int i = 0; i < 4; ++i) out[i] = (dq[i] - along * o.q[i]) * o.inv_norm;
 }
 
 // dL/dmean (world) and dL/d(camera position) are opposite: returns the former.
@@ -903,69 +960,85 @@ void clear_gradients(const SxScene& s, const SxGradients& grad, int64_t chunk) {
   clear(grad.colours, 3 * std::max(1, s.sh_coefficients));
 }
 
-// Carries the summed slot of one Gaussian through its projection.
-void project_backward(const SxScene& s, const Camera& cam, int64_t g, const float* sums, const float* colour,
-                      const SxGradients& grad, CameraSums& cam_sums) {
+// Carries the summed slots of the up to kLanes Gaussians from g on through their projection.
+template <int NC>
+void project_backward(const SxScene& s, const Camera& cam, const ViewOf<NC>& view, int64_t g,
+                      const float (*slots)[kMoments + NC], const SxGradients& grad, CameraSums& cam_sums) {
+  const int n = static_cast<int>(std::min<int64_t>(s.count - g, kLanes));
+  const Rect* rects = view.rects.get() + g;
   Projection o;
-  if (!project(s, cam, g, o)) return;
+  if (!any(project(s, cam, g, o))) return;
+  Vec sums[kMoments + NC];
+  load_rows<kMoments + NC>(slots[0], n, sums);
   // Conic (a, b, c) of the blurred covariance, and the mean: sigma = a dx^2 / 2 + b dx dy + c dy^2 / 2, d = pixel - mean.
-  const float a = o.by / o.det1, b = -o.xy / o.det1, c = o.bx / o.det1;
-  const float d_u = a * sums[1] + b * sums[2], d_v = b * sums[1] + c * sums[2];
-  if (grad.offsets) grad.offsets[2 * g] += d_u, grad.offsets[2 * g + 1] += d_v;
-  const float da = -0.5f * sums[3], half_db = -0.5f * sums[4], dc = -0.5f * sums[5];
+  const Vec a = o.by / o.det1, b = -o.xy / o.det1, c = o.bx / o.det1;
+  const Vec d_u = a * sums[1] + b * sums[2], d_v = b * sums[1] + c * sums[2];
+  const Vec da = -0.5f * sums[3], half_db = -0.5f * sums[4], dc = -0.5f * sums[5];
   // d(covariance) = -Q dQ Q.
-  const float h00 = a * da + b * half_db, h01 = a * half_db + b * dc;
-  const float h10 = b * da + c * half_db, h11 = b * half_db + c * dc;
-  float d_xx = -(h00 * a + h01 * b), d_xy = -2.0f * (h00 * b + h01 * c), d_yy = -(h10 * b + h11 * c);
-  const float d_opacity = sums[0] / o.opacity;  // of the compensated opacity
-  grad.opacities[g] += d_opacity * o.compensation;
-  if (s.antialiased && o.compensation > kMinCompensation) {
-    const float d_ratio = d_opacity * s.opacities[g] * 0.5f / o.compensation;
-    const float d_det0 = d_ratio / o.det1, d_det1 = -d_ratio * o.det0 / (o.det1 * o.det1);
+  const Vec h00 = a * da + b * half_db, h01 = a * half_db + b * dc;
+  const Vec h10 = b * da + c * half_db, h11 = b * half_db + c * dc;
+  Vec d_xx = -(h00 * a + h01 * b), d_xy = -2.0f * (h00 * b + h01 * c), d_yy = -(h10 * b + h11 * c);
+  const Vec d_compensated = sums[0] / o.opacity;
+  const Vec d_opacity = d_compensated * o.compensation;
+  if (s.antialiased) {
+    const Vec d_ratio = keep(o.compensation > kMinCompensation, d_compensated * o.given_opacity * 0.5f / o.compensation);
+    const Vec d_det0 = d_ratio / o.det1, d_det1 = -d_ratio * o.det0 / (o.det1 * o.det1);
     d_xx += d_det0 * o.yy + d_det1 * o.by, d_yy += d_det0 * o.xx + d_det1 * o.bx;
     d_xy -= 2.0f * o.xy * (d_det0 + d_det1);
   }
-  float d_a[9], d_j00 = 0, d_j02 = 0, d_j11 = 0, d_j12 = 0;
+  Vec d_a[9], d_j00{}, d_j02{}, d_j11{}, d_j12{};
   for (int j = 0; j < 3; ++j) {
-    const float d_v0 = 2 * d_xx * o.v0[j] + d_xy * o.v1[j], d_v1 = d_xy * o.v0[j] + 2 * d_yy * o.v1[j];
+    const Vec d_v0 = 2.0f * d_xx * o.v0[j] + d_xy * o.v1[j], d_v1 = d_xy * o.v0[j] + 2.0f * d_yy * o.v1[j];
     d_a[j] = o.j00 * d_v0, d_a[3 + j] = o.j11 * d_v1, d_a[6 + j] = o.j02 * d_v0 + o.j12 * d_v1;
     d_j00 += o.a[j] * d_v0, d_j02 += o.a[6 + j] * d_v0;
     d_j11 += o.a[3 + j] * d_v1, d_j12 += o.a[6 + j] * d_v1;
   }
-  const float iz = o.inv_z;
-  float d_p[3] = {d_u * o.j00, d_v * o.j11, 0};
-  d_p[2] = -(d_u * o.j00 * o.p[0] + d_v * o.j11 * o.p[1]) * iz;
+  const Vec iz = o.inv_z;
+  Vec d_p[3] = {d_u * o.j00, d_v * o.j11, -(d_u * o.j00 * o.p[0] + d_v * o.j11 * o.p[1]) * iz};
   d_p[2] -= iz * (d_j00 * o.j00 + d_j02 * o.j02 + d_j11 * o.j11 + d_j12 * o.j12);
-  if (o.x_free) d_p[0] -= d_j02 * o.j00 * iz, d_p[2] += d_j02 * o.j00 * o.rx * iz;
-  if (o.y_free) d_p[1] -= d_j12 * o.j11 * iz, d_p[2] += d_j12 * o.j11 * o.ry * iz;
-  int channel = kMoments + 3;
-  if (s.with_depth) d_p[2] += sums[channel++];
-  for (int e = 0; e < s.extra_channels; ++e)
-    if (grad.extras) grad.extras[g * s.extra_channels + e] += sums[channel + e];
+  d_p[0] -= keep(o.x_free, d_j02 * o.j00 * iz), d_p[2] += keep(o.x_free, d_j02 * o.j00 * o.rx * iz);
+  d_p[1] -= keep(o.y_free, d_j12 * o.j11 * iz), d_p[2] += keep(o.y_free, d_j12 * o.j11 * o.ry * iz);
+  if constexpr (NC > 3)
+    if (s.with_depth) d_p[2] += sums[kMoments + 3];
 
-  const float* scale = s.scales + 3 * g;
-  float d_rot[9], d_scale[3] = {};
+  Vec d_rot[9], d_scale[3] = {}, d_quat[4];
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) {
-      const float d_m = cam.r[i] * d_a[j] + cam.r[3 + i] * d_a[3 + j] + cam.r[6 + i] * d_a[6 + j];
+      const Vec d_m = cam.r[i] * d_a[j] + cam.r[3 + i] * d_a[3 + j] + cam.r[6 + i] * d_a[6 + j];
       d_scale[j] += o.rot[3 * i + j] * d_m;
-      d_rot[3 * i + j] = d_m * scale[j];
+      d_rot[3 * i + j] = d_m * o.scale[j];
     }
-  for (int j = 0; j < 3; ++j) grad.scales[3 * g + j] += d_scale[j];
-  quat_backward(o, d_rot, grad.quats + 4 * g);
+  quat_backward(o, d_rot, d_quat);
 
-  const float* m = s.means + 3 * g;
-  float d_seen[3] = {0, 0, 0};  // dL/dmean through the viewing direction
-  shade_backward(s, cam, g, colour, sums + kMoments, grad.colours, d_seen);
-  for (int i = 0; i < 3; ++i)
-    grad.means[3 * g + i] += cam.r[i] * d_p[0] + cam.r[3 + i] * d_p[1] + cam.r[6 + i] * d_p[2] + d_seen[i];
+  Vec d_seen[3] = {};  // dL/dmean through the viewing direction
+  for (int lane = 0; lane < n; ++lane) {
+    if (!is_seen(rects[lane])) continue;
+    float d[3] = {};
+    shade_backward(s, cam, g + lane, view.records[g + lane].feature, slots[lane] + kMoments, grad.colours, d);
+    for (int i = 0; i < 3; ++i) d_seen[i][lane] = d[i];
+  }
+  Vec d_mean[3], d_t[3], d_r[9];
   for (int i = 0; i < 3; ++i) {
-    cam_sums.t[i] += d_p[i] + dot3(cam.r + 3 * i, d_seen);  // camera position = -R^T t moves against the mean
+    d_mean[i] = cam.r[i] * d_p[0] + cam.r[3 + i] * d_p[1] + cam.r[6 + i] * d_p[2] + d_seen[i];
+    d_t[i] = d_p[i] + dot3(cam.r + 3 * i, d_seen);  // camera position = -R^T t moves against the mean
     for (int j = 0; j < 3; ++j) {
-      float d_r = d_p[i] * m[j] + cam.t[i] * d_seen[j];
-      for (int k = 0; k < 3; ++k) d_r += d_a[3 * i + k] * scale[k] * o.rot[3 * j + k];
-      cam_sums.r[3 * i + j] += d_r;
+      d_r[3 * i + j] = d_p[i] * o.m[j] + cam.t[i] * d_seen[j];
+      for (int k = 0; k < 3; ++k) d_r[3 * i + j] += d_a[3 * i + k] * o.scale[k] * o.rot[3 * j + k];
     }
+  }
+
+  for (int lane = 0; lane < n; ++lane) {
+    if (!is_seen(rects[lane])) continue;
+    const int64_t at = g + lane;
+    const float* extras = slots[lane] + kMoments + 3 + s.with_depth;
+    for (int i = 0; i < 3; ++i) grad.means[3 * at + i] += d_mean[i][lane], grad.scales[3 * at + i] += d_scale[i][lane];
+    for (int i = 0; i < 4; ++i) grad.quats[4 * at + i] += d_quat[i][lane];
+    grad.opacities[at] += d_opacity[lane];
+    if (grad.offsets) grad.offsets[2 * at] += d_u[lane], grad.offsets[2 * at + 1] += d_v[lane];
+    if (grad.extras)
+      for (int e = 0; e < s.extra_channels; ++e) grad.extras[at * s.extra_channels + e] += extras[e];
+    for (int i = 0; i < 9; ++i) cam_sums.r[i] += d_r[i][lane];
+    for (int i = 0; i < 3; ++i) cam_sums.t[i] += d_t[i][lane];
   }
 }
 
@@ -984,11 +1057,6 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
     const float* slot = first_slot(g);
     for (int64_t n = tiles_in(view.rects[g], row0, row1); n > 0; --n, slot += kSlot)
       for (int k = 0; k < kSlot; ++k) sums[k] += slot[k];
-  };
-  auto each_visible = [&](int64_t chunk, const auto& fn) {
-    each_of_chunk(chunk, s.count, [&](int64_t g) {
-      if (view.rects[g].x0 < view.rects[g].x1) fn(g);
-    });
   };
 
   for (size_t band = 0; band + 1 < view.bands.size(); ++band) {
@@ -1022,7 +1090,7 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
     });
     if (!banded) break;
     parallel_for(s.threads, chunks, [&](int64_t chunk) {
-      each_visible(chunk, [&](int64_t g) { add_slots(g, row0, row1, carried.data() + g * kSlot); });
+      each_of_chunk(chunk, s.count, [&](int64_t g) { add_slots(g, row0, row1, carried.data() + g * kSlot); });
     });
   }
 
@@ -1030,15 +1098,16 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
   std::vector<CameraSums> cam_sums(chunks);
   parallel_for(s.threads, chunks, [&](int64_t chunk) {
     clear_gradients(s, grad, chunk);  // here rather than all at once: every thread, and rows that stay in its cache
-    each_visible(chunk, [&](int64_t g) {
-      float own[kSlot] = {};
-      float* sums = own;
+    const int64_t end = std::min<int64_t>(s.count, (chunk + 1) * kChunk);
+    for (int64_t g = chunk * kChunk; g < end; g += kLanes) {
+      float sums[kLanes][kSlot] = {};
+      const int64_t n = std::min<int64_t>(end - g, kLanes);
       if (banded)
-        sums = carried.data() + g * kSlot;
+        std::copy_n(carried.data() + g * kSlot, n * kSlot, sums[0]);
       else
-        add_slots(g, 0, view.tiles_y, own);
-      project_backward(s, cam, g, sums, view.records[g].feature, grad, cam_sums[chunk]);
-    });
+        for (int64_t lane = 0; lane < n; ++lane) add_slots(g + lane, 0, view.tiles_y, sums[lane]);
+      project_backward<NC>(s, cam, view, g, sums, grad, cam_sums[chunk]);
+    }
   });
   std::fill_n(grad.cam_from_world, 16, 0.0f);
   CameraSums total;
