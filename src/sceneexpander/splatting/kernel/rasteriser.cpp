@@ -18,12 +18,15 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <condition_variable>
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
 #include <exception>
+#include <functional>
 #include <limits>
 #include <memory>
+#include <mutex>
 #include <new>
 #include <thread>
 #include <utility>
@@ -177,32 +180,87 @@ SX_INLINE Vec exp2_vec(Vec t) {
   return (Vec)((Mask)p + ((Mask)shifted << 23));
 }
 
-// Runs fn(0..count-1) on up to `threads` threads, each pulling the next index. Rethrows the first exception.
-template <class Fn>
-void parallel_for(int threads, int64_t count, const Fn& fn) {
-  std::atomic<int64_t> next{0};
-  std::exception_ptr failure;
-  std::atomic<bool> failed{false};
-  auto work = [&] {
-    try {
-      for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) fn(i);
-    } catch (...) {
-      if (!failed.exchange(true)) failure = std::current_exception();
-    }
-  };
-  std::vector<std::thread> team;
-  const int64_t helpers = std::min<int64_t>(threads, count) - 1;
-  for (int64_t i = 0; i < helpers; ++i) {
-    try {
-      team.emplace_back(work);
-    } catch (const std::exception&) {
-      break;  // the system gives no more threads: fewer do the same work
+// The threads of one call: the caller and its helpers. They end with the call, so a process may fork between calls.
+class Team {
+ public:
+  explicit Team(int threads) : parts_(std::max(1, threads)) {
+    for (int i = 1; i < parts_; ++i) {
+      try {
+        helpers_.emplace_back([this] { help(); });
+      } catch (const std::exception&) {
+        break;  // the system gives no more threads: fewer do the same work
+      }
     }
   }
-  work();
-  for (auto& thread : team) thread.join();
-  if (failure) std::rethrow_exception(failure);
-}
+  ~Team() {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      ended_ = true;
+    }
+    wake_.notify_all();
+    for (auto& helper : helpers_) helper.join();
+  }
+  Team(const Team&) = delete;
+  Team& operator=(const Team&) = delete;
+
+  // Into how many parts to cut work that cannot be dealt out piece by piece.
+  int64_t parts() const { return parts_; }
+
+  // Runs fn(0..count-1), every thread pulling the next index. Rethrows the first exception. A helper that has not woken up by
+  // the time the work is dealt out is not waited for: on a busy machine that would take longer than the work.
+  template <class Fn>
+  void run(int64_t count, const Fn& fn) {
+    std::atomic<int64_t> next{0};
+    std::exception_ptr failure;
+    std::atomic<bool> failed{false};
+    const std::function<void()> work = [&] {
+      try {
+        for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) fn(i);
+      } catch (...) {
+        if (!failed.exchange(true)) failure = std::current_exception();
+      }
+    };
+    if (count > 1 && !helpers_.empty()) {
+      {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        work_ = &work, ++round_;
+      }
+      wake_.notify_all();
+    }
+    work();
+    {
+      std::unique_lock<std::mutex> lock(mutex_);
+      work_ = nullptr;
+      done_.wait(lock, [&] { return busy_ == 0; });
+    }
+    if (failure) std::rethrow_exception(failure);
+  }
+
+ private:
+  void help() {
+    std::unique_lock<std::mutex> lock(mutex_);
+    for (uint64_t last = 0;;) {
+      wake_.wait(lock, [&] { return ended_ || (work_ && round_ != last); });
+      if (ended_) return;
+      last = round_;
+      const std::function<void()>& work = *work_;
+      ++busy_;
+      lock.unlock();
+      work();
+      lock.lock();
+      if (--busy_ == 0) done_.notify_one();
+    }
+  }
+
+  const int parts_;
+  std::vector<std::thread> helpers_;
+  std::mutex mutex_;  // of all below
+  std::condition_variable wake_, done_;
+  const std::function<void()>* work_ = nullptr;
+  uint64_t round_ = 0;
+  int busy_ = 0;
+  bool ended_ = false;
+};
 
 struct Free {
   void operator()(void* p) const { std::free(p); }
@@ -556,10 +614,10 @@ void make_records(const SxScene& s, const Camera& cam, int64_t g, ViewOf<NC>& vi
 }
 
 template <int NC>
-void project_all(const SxScene& s, const Camera& cam, ViewOf<NC>& view, DepthKeys& keys, float* radii) {
+void project_all(const SxScene& s, Team& team, const Camera& cam, ViewOf<NC>& view, DepthKeys& keys, float* radii) {
   std::vector<SeenCount> counts(chunks_of(s.count));
   keys.key = uninitialised<uint32_t>(s.count);
-  parallel_for(s.threads, chunks_of(s.count), [&](int64_t chunk) {
+  team.run(chunks_of(s.count), [&](int64_t chunk) {
     SeenCount own;
     for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); g += kLanes)
       make_records<NC>(s, cam, g, view, keys.key.get(), radii, own);
@@ -575,12 +633,12 @@ void project_all(const SxScene& s, const Camera& cam, ViewOf<NC>& view, DepthKey
 
 // Stable radix sort of the visible Gaussians by key, in digits of equal width from the lowest. Each part of the list counts, then
 // writes behind the parts before it: there is only one stable order, so the number of parts does not show.
-void order_by_depth(int threads, const DepthKeys& keys, View& view) {
+void order_by_depth(Team& team, const DepthKeys& keys, View& view) {
   struct Item {
     uint32_t key, index;
   };
   auto items = uninitialised<Item>(view.visible), other = uninitialised<Item>(view.visible);
-  parallel_for(threads, chunks_of(view.count), [&](int64_t chunk) {
+  team.run(chunks_of(view.count), [&](int64_t chunk) {
     Item* next = items.get() + keys.before[chunk];
     each_of_chunk(chunk, view.count, [&](int64_t g) {
       if (keys.key[g] != kCulled) *next++ = {keys.key[g] - keys.least, static_cast<uint32_t>(g)};
@@ -592,12 +650,12 @@ void order_by_depth(int threads, const DepthKeys& keys, View& view) {
   const int passes = (bits + kDigitBits - 1) / kDigitBits;
   const int width = passes > 0 ? (bits + passes - 1) / passes : 0;
   const uint32_t digits = 1u << width;
-  const int64_t parts = std::max(1, threads);
+  const int64_t parts = team.parts();
   auto range = [&](int64_t part) { return part * view.visible / parts; };
   std::vector<uint32_t> cursor(parts * digits);
   for (int shift = 0; shift < bits; shift += width) {
     auto digit = [&](const Item& item) { return item.key >> shift & (digits - 1); };
-    parallel_for(threads, parts, [&](int64_t part) {
+    team.run(parts, [&](int64_t part) {
       uint32_t* mine = cursor.data() + part * digits;
       std::fill(mine, mine + digits, 0);
       for (int64_t i = range(part); i < range(part + 1); ++i) ++mine[digit(items[i])];
@@ -605,7 +663,7 @@ void order_by_depth(int threads, const DepthKeys& keys, View& view) {
     uint32_t total = 0;
     for (uint32_t d = 0; d < digits; ++d)
       for (int64_t part = 0; part < parts; ++part) total += std::exchange(cursor[part * digits + d], total);
-    parallel_for(threads, parts, [&](int64_t part) {
+    team.run(parts, [&](int64_t part) {
       uint32_t* mine = cursor.data() + part * digits;
       for (int64_t i = range(part); i < range(part + 1); ++i) other[mine[digit(items[i])]++] = items[i];
     });
@@ -613,7 +671,7 @@ void order_by_depth(int threads, const DepthKeys& keys, View& view) {
   }
   view.order = uninitialised<uint32_t>(view.visible);
   view.ordered_rects = uninitialised<Rect>(view.visible);
-  parallel_for(threads, parts, [&](int64_t part) {
+  team.run(parts, [&](int64_t part) {
     for (int64_t i = range(part); i < range(part + 1); ++i) {
       view.order[i] = items[i].index;
       view.ordered_rects[i] = view.rects[items[i].index];
@@ -658,12 +716,12 @@ SX_INLINE void each_tile(const Rect& r, int row0, int row1, int tiles_x, const F
 }
 
 // Stable counting sort: each part of the depth order counts, then writes behind the parts before it.
-void fill_bins(const View& view, int threads, int row0, int row1, Bins& bins) {
+void fill_bins(const View& view, Team& team, int row0, int row1, Bins& bins) {
   const int64_t tiles = static_cast<int64_t>(row1 - row0) * view.tiles_x;
-  const int64_t parts = std::max(1, threads);
+  const int64_t parts = team.parts();
   std::vector<uint64_t> cursor(parts * tiles, 0);
   auto range = [&](int64_t part) { return part * view.visible / parts; };
-  parallel_for(threads, parts, [&](int64_t part) {
+  team.run(parts, [&](int64_t part) {
     uint64_t* mine = cursor.data() + part * tiles;
     for (int64_t i = range(part); i < range(part + 1); ++i)
       each_tile(view.ordered_rects[i], row0, row1, view.tiles_x, [&](int tile, int is_new) { mine[tile] += is_new; });
@@ -681,7 +739,7 @@ void fill_bins(const View& view, int threads, int row0, int row1, Bins& bins) {
   }
   bins.start[tiles] = total;
   bins.entries = uninitialised<uint32_t>(total);
-  parallel_for(threads, parts, [&](int64_t part) {
+  team.run(parts, [&](int64_t part) {
     uint64_t* mine = cursor.data() + part * tiles;
     uint32_t* entries = bins.entries.get();
     for (int64_t i = range(part); i < range(part + 1); ++i)
@@ -795,6 +853,7 @@ void blend_tile(const SxScene& s, const Record<NC>* records, const uint32_t* ent
 
 template <int NC>
 View* forward(const SxScene& s, float* planes, float* transmittance, float* radii) {
+  Team team(s.threads);
   auto view = std::make_unique<ViewOf<NC>>();
   view->count = s.count;
   view->channels = NC;
@@ -803,15 +862,15 @@ View* forward(const SxScene& s, float* planes, float* transmittance, float* radi
   view->rects = uninitialised<Rect>(s.count);
   {
     DepthKeys keys;
-    project_all<NC>(s, Camera(s), *view, keys, radii);
-    order_by_depth(s.threads, keys, *view);
+    project_all<NC>(s, team, Camera(s), *view, keys, radii);
+    order_by_depth(team, keys, *view);
   }
   choose_bands(s, *view);
   for (size_t band = 0; band + 1 < view->bands.size(); ++band) {
     const int row0 = view->bands[band], row1 = view->bands[band + 1];
-    fill_bins(*view, s.threads, row0, row1, view->bins);
+    fill_bins(*view, team, row0, row1, view->bins);
     const Bins& bins = view->bins;
-    parallel_for(s.threads, static_cast<int64_t>(row1 - row0) * view->tiles_x, [&](int64_t tile) {
+    team.run(static_cast<int64_t>(row1 - row0) * view->tiles_x, [&](int64_t tile) {
       const TileArea area =
           tile_area(s, static_cast<int>(tile % view->tiles_x), row0 + static_cast<int>(tile / view->tiles_x));
       blend_tile<NC>(s, view->records.get(), bins.entries.get() + bins.start[tile],
@@ -1045,6 +1104,7 @@ void project_backward(const SxScene& s, const Camera& cam, const ViewOf<NC>& vie
 template <int NC>
 void backward(const SxScene& s, View& base, const Upstream& up, const SxGradients& grad) {
   constexpr int kSlot = kMoments + NC;
+  Team team(s.threads);
   auto& view = static_cast<ViewOf<NC>&>(base);
   const bool banded = view.bands.size() > 2;
   const int64_t chunks = chunks_of(s.count);
@@ -1062,9 +1122,9 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
   for (size_t band = 0; band + 1 < view.bands.size(); ++band) {
     const int row0 = view.bands[band], row1 = view.bands[band + 1];
     Bins refilled;
-    if (banded) fill_bins(view, s.threads, row0, row1, refilled);
+    if (banded) fill_bins(view, team, row0, row1, refilled);
     const Bins& bins = banded ? refilled : view.bins;
-    parallel_for(s.threads, chunks, [&](int64_t chunk) {
+    team.run(chunks, [&](int64_t chunk) {
       uint64_t in_chunk = 0;
       each_of_chunk(chunk, s.count, [&](int64_t g) {
         offset[g] = in_chunk;
@@ -1075,7 +1135,7 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
     uint64_t total = 0;
     for (uint64_t& in_chunk : chunk_offset) total += std::exchange(in_chunk, total);
     slots = uninitialised<float>(total * kSlot);
-    parallel_for(s.threads, static_cast<int64_t>(row1 - row0) * view.tiles_x, [&](int64_t tile) {
+    team.run(static_cast<int64_t>(row1 - row0) * view.tiles_x, [&](int64_t tile) {
       const int column = static_cast<int>(tile % view.tiles_x), row = row0 + static_cast<int>(tile / view.tiles_x);
       auto fetch = [&](uint32_t g) {
         __builtin_prefetch(&view.records[g]), __builtin_prefetch(&view.rects[g]), __builtin_prefetch(&offset[g]);
@@ -1089,14 +1149,14 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
                               bins.start[tile + 1] - bins.start[tile], tile_area(s, column, row), up, slot_of, fetch);
     });
     if (!banded) break;
-    parallel_for(s.threads, chunks, [&](int64_t chunk) {
+    team.run(chunks, [&](int64_t chunk) {
       each_of_chunk(chunk, s.count, [&](int64_t g) { add_slots(g, row0, row1, carried.data() + g * kSlot); });
     });
   }
 
   const Camera cam(s);
   std::vector<CameraSums> cam_sums(chunks);
-  parallel_for(s.threads, chunks, [&](int64_t chunk) {
+  team.run(chunks, [&](int64_t chunk) {
     clear_gradients(s, grad, chunk);  // here rather than all at once: every thread, and rows that stay in its cache
     const int64_t end = std::min<int64_t>(s.count, (chunk + 1) * kChunk);
     for (int64_t g = chunk * kChunk; g < end; g += kLanes) {
