@@ -1,7 +1,7 @@
 // Rasteriser of 3D Gaussians with gradients, for CPUs. C ABI, C++17, no dependencies, own threads.
 //
 // One call renders one view. The plan:
-//   project   every Gaussian once -> a compact record, a tile rectangle and a depth key
+//   project   every Gaussian once, one per lane of a vector -> a compact record, a tile rectangle and a depth key
 //   order     stable radix sort of the Gaussians (not of the intersections) by the bits of their depth
 //   bin       stable counting sort of the ordered Gaussians into tiles, in bands of tile rows when memory would not do
 //   blend     per tile, front to back: windows of kColumns x kRows pixels over a Gaussian's box
@@ -63,6 +63,7 @@ constexpr int kDoneEvery = 16;     // Gaussians between two tests whether a tile
 constexpr int kAhead = 8;          // Gaussians by which records are fetched ahead: a tile's lie all over memory
 constexpr int kDigitBits = 12;     // most bits of a depth that one pass of the sort takes
 constexpr int kChunk = 2048;       // Gaussians per unit of work; fixed, so that partial sums do not depend on threads
+static_assert(kChunk % kLanes == 0, "a chunk is whole vectors of Gaussians");
 constexpr float kMinAlpha = 1.0f / 255.0f;
 constexpr float kMinTransmittance = 1e-4f;
 constexpr float kMinDeterminant = 1e-10f;
@@ -553,6 +554,12 @@ SX_INLINE void each_of_chunk(int64_t chunk, int64_t count, const Fn& fn) {
   for (int64_t g = chunk * kChunk; g < std::min<int64_t>(count, (chunk + 1) * kChunk); ++g) fn(g);
 }
 
+// No more threads than there are units of work.
+int threads_for(const SxScene& s) {
+  const int64_t tiles = static_cast<int64_t>((s.width + kTileW - 1) / kTileW) * ((s.height + kTileH - 1) / kTileH);
+  return static_cast<int>(std::min<int64_t>(s.threads, std::max(tiles, chunks_of(s.count))));
+}
+
 struct DepthKeys {
   Buffer<uint32_t> key;         // by Gaussian, kCulled where it cannot be seen
   std::vector<int64_t> before;  // visible Gaussians before each chunk
@@ -853,7 +860,7 @@ void blend_tile(const SxScene& s, const Record<NC>* records, const uint32_t* ent
 
 template <int NC>
 View* forward(const SxScene& s, float* planes, float* transmittance, float* radii) {
-  Team team(s.threads);
+  Team team(threads_for(s));
   auto view = std::make_unique<ViewOf<NC>>();
   view->count = s.count;
   view->channels = NC;
@@ -1104,7 +1111,7 @@ void project_backward(const SxScene& s, const Camera& cam, const ViewOf<NC>& vie
 template <int NC>
 void backward(const SxScene& s, View& base, const Upstream& up, const SxGradients& grad) {
   constexpr int kSlot = kMoments + NC;
-  Team team(s.threads);
+  Team team(threads_for(s));
   auto& view = static_cast<ViewOf<NC>&>(base);
   const bool banded = view.bands.size() > 2;
   const int64_t chunks = chunks_of(s.count);
