@@ -270,7 +270,8 @@ template <class T>
 using Buffer = std::unique_ptr<T[], Free>;
 
 // Every call takes and returns tens of megabytes: in pages of 4 KiB, each of which the system hands over by itself, that costs a
-// tenth of the time. Large buffers ask for pages of 2 MiB.
+// tenth of the time. Large buffers ask for pages of 2 MiB, and for all of them from one thread: two threads that are the first to
+// touch a page would both clear one.
 template <class T>
 Buffer<T> uninitialised(size_t count) {
   constexpr size_t kHuge = size_t{1} << 21;
@@ -279,7 +280,10 @@ Buffer<T> uninitialised(size_t count) {
   void* p = std::aligned_alloc(align, (bytes + align - 1) / align * align);
   if (!p) throw std::bad_alloc();
 #if defined(__linux__)
-  if (align == kHuge) madvise(p, bytes, MADV_HUGEPAGE);  // a wish: nothing depends on the answer
+  if (align == kHuge) {
+    madvise(p, bytes, MADV_HUGEPAGE);  // a wish: nothing depends on the answer
+    for (size_t at = 0; at < bytes; at += kHuge) static_cast<char*>(p)[at] = 0;
+  }
 #endif
   return Buffer<T>(static_cast<T*>(p));
 }
