@@ -20,7 +20,7 @@ from sceneexpander.splatting.scene import RasterScene
 
 logger = logging.getLogger(__name__)
 
-ABI_VERSION = 1
+ABI_VERSION = 2
 KERNEL_DIRECTORY = Path(__file__).parent / "kernel"
 # Builds by what the CPU can do, best first.
 BUILDS = {"AVX512": ("v4", "v3", "plain"), "AVX2": ("v3", "plain")}
@@ -47,7 +47,7 @@ class _Scene(ctypes.Structure):
 class _Gradients(ctypes.Structure):
     """``SxGradients`` of ``rasteriser.cpp``."""
 
-    _fields_ = [(name, ctypes.c_void_p) for name in _POINTERS_OUT]
+    _fields_ = [("add", ctypes.c_int32)] + [(name, ctypes.c_void_p) for name in _POINTERS_OUT]
 
 
 class _Kernel:
@@ -187,11 +187,12 @@ class _Rasterise(torch.autograd.Function):
         scene: RasterScene = ctx.scene
         held = [None if t is None else t.detach().contiguous() for t in tensors]
         planes, d_planes, d_alpha = planes.contiguous(), d_planes.contiguous(), d_alpha.contiguous()
-        # Contiguous buffers: the kernel adds to them, view after view.
-        gradients = [None if t is None else torch.zeros(t.shape, dtype=t.dtype) for t in tensors[:-1]]
+        # Contiguous buffers: the kernel sets them for the first view, and adds to the shared ones for those after it.
+        fresh = torch.empty if scene.views else torch.zeros
+        gradients = [None if t is None else fresh(t.shape, dtype=t.dtype) for t in tensors[:-1]]
         for view in range(scene.views):
             rows = [g if i < len(_SHARED) or g is None else g[view] for i, g in enumerate(gradients)]
-            described = _Gradients(*(None if row is None else row.data_ptr() for row in rows))
+            described = _Gradients(int(view > 0), *(None if row is None else row.data_ptr() for row in rows))
             failed = ctx.kernel.backward(
                 _describe(scene, held, view),
                 ctx.states[view].handle,

@@ -95,8 +95,9 @@ def test_oracle_gradients_are_those_of_its_images(antialiased: bool, as_rgb: boo
 
 
 @needs_kernel
-def test_kernel_gradients_do_not_depend_on_threads_or_bands() -> None:
-    scene, poses = random_gaussians(500, seed=2), cameras(2)
+@pytest.mark.parametrize("count", [500, 5003])  # in one and in several units of work
+def test_kernel_gradients_do_not_depend_on_threads_or_bands(count: int) -> None:
+    scene, poses = random_gaussians(count, seed=2), cameras(2)
     reference = gradients(scene, poses, settings("cpu", threads=1))
     for changes in (
         {"threads": 2},
@@ -106,6 +107,20 @@ def test_kernel_gradients_do_not_depend_on_threads_or_bands() -> None:
     ):
         for name, value in gradients(scene, poses, settings("cpu", **changes)).items():
             assert torch.equal(value, reference[name]), f"{name} differs with {changes}"
+
+
+@needs_kernel
+def test_gradients_of_several_views_are_the_sum_of_each_and_of_none_zero() -> None:
+    scene, poses, k = random_gaussians(300, seed=3), cameras(2), intrinsics(2, H, W)
+
+    def gradient(views: slice) -> Tensor:
+        leaf = scene.means.clone().requires_grad_()
+        picture = render(replace(scene, means=leaf), poses[views], k[views], H, W, settings=settings("cpu"))
+        (grad,) = torch.autograd.grad((picture.rgb**2).sum(), leaf)
+        return grad
+
+    torch.testing.assert_close(gradient(slice(0, 2)), gradient(slice(0, 1)) + gradient(slice(1, 2)))
+    assert not gradient(slice(0, 0)).any()
 
 
 @needs_kernel

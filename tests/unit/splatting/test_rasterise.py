@@ -78,8 +78,9 @@ def test_kernel_agrees_in_float64_precision_of_the_oracle() -> None:
 
 
 @needs_kernel
-def test_kernel_images_do_not_depend_on_threads_or_bands() -> None:
-    scene, poses, k = random_gaussians(500, seed=2), cameras(2), intrinsics(2, H, W)
+@pytest.mark.parametrize("count", [500, 5003])  # in one and in several units of work
+def test_kernel_images_do_not_depend_on_threads_or_bands(count: int) -> None:
+    scene, poses, k = random_gaussians(count, seed=2), cameras(2), intrinsics(2, H, W)
     reference = render(scene, poses, k, H, W, settings=settings("cpu", threads=1))
     for changes in (
         {"threads": 2},

@@ -1,7 +1,7 @@
 // Rasteriser of 3D Gaussians with gradients, for CPUs. C ABI, C++17, no dependencies, own threads.
 //
 // One call renders one view. The plan:
-//   project   every Gaussian once -> a compact record, a tile rectangle and a depth key
+//   project   every Gaussian once, one per lane of a vector -> a compact record, a tile rectangle and a depth key
 //   order     stable radix sort of the Gaussians (not of the intersections) by the bits of their depth
 //   bin       stable counting sort of the ordered Gaussians into tiles, in bands of tile rows when memory would not do
 //   blend     per tile, front to back: windows of kColumns x kRows pixels over a Gaussian's box
@@ -18,14 +18,18 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <condition_variable>
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
 #include <exception>
+#include <functional>
 #include <limits>
 #include <memory>
+#include <mutex>
 #include <new>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #if defined(__linux__)
@@ -57,7 +61,9 @@ constexpr int kPixels = kTileH / kRows * kStride;
 constexpr int kMoments = 6;        // sums over pixels: v, v dx, v dy, v dx^2, v dx dy, v dy^2
 constexpr int kDoneEvery = 16;     // Gaussians between two tests whether a tile is finished
 constexpr int kAhead = 8;          // Gaussians by which records are fetched ahead: a tile's lie all over memory
+constexpr int kDigitBits = 12;     // most bits of a depth that one pass of the sort takes
 constexpr int kChunk = 2048;       // Gaussians per unit of work; fixed, so that partial sums do not depend on threads
+static_assert(kChunk % kLanes == 0, "a chunk is whole vectors of Gaussians");
 constexpr float kMinAlpha = 1.0f / 255.0f;
 constexpr float kMinTransmittance = 1e-4f;
 constexpr float kMinDeterminant = 1e-10f;
@@ -93,6 +99,40 @@ SX_INLINE float lane_sum(Vec v) {
   for (int half = kLanes / 2; half > 0; half /= 2)
     for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
   return lanes[0];
+}
+
+SX_INLINE bool any(Mask mask) {
+  int32_t lanes[kLanes], found = 0;
+  std::memcpy(lanes, &mask, sizeof lanes);
+  for (int32_t lane : lanes) found |= lane;
+  return found != 0;
+}
+template <class Fn>
+SX_INLINE Vec each_lane(Vec v, const Fn& fn) {
+  float lanes[kLanes];
+  store(lanes, v);
+  for (float& lane : lanes) lane = fn(lane);
+  return load(lanes);
+}
+SX_INLINE Vec sqrt_vec(Vec v) {
+  return each_lane(v, [](float x) { return std::sqrt(x); });
+}
+SX_INLINE Vec ceil_vec(Vec v) {
+  return each_lane(v, [](float x) { return std::ceil(x); });
+}
+SX_INLINE Vec floor_vec(Vec v) {
+  return each_lane(v, [](float x) { return std::floor(x); });
+}
+SX_INLINE Vec max_vec(Vec a, Vec b) { return a < b ? b : a; }
+SX_INLINE Vec min_vec(Vec a, Vec b) { return b < a ? b : a; }
+
+// Up to kLanes rows of W floats as W vectors, a row in each lane; zeros in the lanes without a row.
+template <int W>
+SX_INLINE void load_rows(const float* rows, int count, Vec* out) {
+  float columns[W][kLanes] = {};
+  for (int lane = 0; lane < count; ++lane)
+    for (int i = 0; i < W; ++i) columns[i][lane] = rows[lane * W + i];
+  for (int i = 0; i < W; ++i) out[i] = load(columns[i]);
 }
 
 // out[i] = sum of the lanes of v[i]. Eight vectors at a time by adding shuffled pairs, where the compiler has shuffles.
@@ -141,32 +181,87 @@ SX_INLINE Vec exp2_vec(Vec t) {
   return (Vec)((Mask)p + ((Mask)shifted << 23));
 }
 
-// Runs fn(0..count-1) on up to `threads` threads, each pulling the next index. Rethrows the first exception.
-template <class Fn>
-void parallel_for(int threads, int64_t count, const Fn& fn) {
-  std::atomic<int64_t> next{0};
-  std::exception_ptr failure;
-  std::atomic<bool> failed{false};
-  auto work = [&] {
-    try {
-      for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) fn(i);
-    } catch (...) {
-      if (!failed.exchange(true)) failure = std::current_exception();
-    }
-  };
-  std::vector<std::thread> team;
-  const int64_t helpers = std::min<int64_t>(threads, count) - 1;
-  for (int64_t i = 0; i < helpers; ++i) {
-    try {
-      team.emplace_back(work);
-    } catch (const std::exception&) {
-      break;  // the system gives no more threads: fewer do the same work
+// The threads of one call: the caller and its helpers. They end with the call, so a process may fork between calls.
+class Team {
+ public:
+  explicit Team(int threads) : parts_(std::max(1, threads)) {
+    for (int i = 1; i < parts_; ++i) {
+      try {
+        helpers_.emplace_back([this] { help(); });
+      } catch (const std::exception&) {
+        break;  // the system gives no more threads: fewer do the same work
+      }
     }
   }
-  work();
-  for (auto& thread : team) thread.join();
-  if (failure) std::rethrow_exception(failure);
-}
+  ~Team() {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      ended_ = true;
+    }
+    wake_.notify_all();
+    for (auto& helper : helpers_) helper.join();
+  }
+  Team(const Team&) = delete;
+  Team& operator=(const Team&) = delete;
+
+  // Into how many parts to cut work that cannot be dealt out piece by piece.
+  int64_t parts() const { return parts_; }
+
+  // Runs fn(0..count-1), every thread pulling the next index. Rethrows the first exception. A helper that has not woken up by
+  // the time the work is dealt out is not waited for: on a busy machine that would take longer than the work.
+  template <class Fn>
+  void run(int64_t count, const Fn& fn) {
+    std::atomic<int64_t> next{0};
+    std::exception_ptr failure;
+    std::atomic<bool> failed{false};
+    const std::function<void()> work = [&] {
+      try {
+        for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) fn(i);
+      } catch (...) {
+        if (!failed.exchange(true)) failure = std::current_exception();
+      }
+    };
+    if (count > 1 && !helpers_.empty()) {
+      {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        work_ = &work, ++round_;
+      }
+      wake_.notify_all();
+    }
+    work();
+    {
+      std::unique_lock<std::mutex> lock(mutex_);
+      work_ = nullptr;
+      done_.wait(lock, [&] { return busy_ == 0; });
+    }
+    if (failure) std::rethrow_exception(failure);
+  }
+
+ private:
+  void help() {
+    std::unique_lock<std::mutex> lock(mutex_);
+    for (uint64_t last = 0;;) {
+      wake_.wait(lock, [&] { return ended_ || (work_ && round_ != last); });
+      if (ended_) return;
+      last = round_;
+      const std::function<void()>& work = *work_;
+      ++busy_;
+      lock.unlock();
+      work();
+      lock.lock();
+      if (--busy_ == 0) done_.notify_one();
+    }
+  }
+
+  const int parts_;
+  std::vector<std::thread> helpers_;
+  std::mutex mutex_;  // of all below
+  std::condition_variable wake_, done_;
+  const std::function<void()>* work_ = nullptr;
+  uint64_t round_ = 0;
+  int busy_ = 0;
+  bool ended_ = false;
+};
 
 struct Free {
   void operator()(void* p) const { std::free(p); }
@@ -175,7 +270,8 @@ template <class T>
 using Buffer = std::unique_ptr<T[], Free>;
 
 // Every call takes and returns tens of megabytes: in pages of 4 KiB, each of which the system hands over by itself, that costs a
-// tenth of the time. Large buffers ask for pages of 2 MiB.
+// tenth of the time. Large buffers ask for pages of 2 MiB, and for all of them from one thread: two threads that are the first to
+// touch a page would both clear one.
 template <class T>
 Buffer<T> uninitialised(size_t count) {
   constexpr size_t kHuge = size_t{1} << 21;
@@ -184,7 +280,10 @@ Buffer<T> uninitialised(size_t count) {
   void* p = std::aligned_alloc(align, (bytes + align - 1) / align * align);
   if (!p) throw std::bad_alloc();
 #if defined(__linux__)
-  if (align == kHuge) madvise(p, bytes, MADV_HUGEPAGE);  // a wish: nothing depends on the answer
+  if (align == kHuge) {
+    madvise(p, bytes, MADV_HUGEPAGE);  // a wish: nothing depends on the answer
+    for (size_t at = 0; at < bytes; at += kHuge) static_cast<char*>(p)[at] = 0;
+  }
 #endif
   return Buffer<T>(static_cast<T*>(p));
 }
@@ -215,8 +314,9 @@ struct SxScene {
   const float* intrinsics;      // [3,3]
 };
 
-// Gradients are added to what the buffers hold.
+// Gradients of what views share are added to what the buffers hold if `add`; all others are set.
 struct SxGradients {
+  int32_t add;
   float *means, *quats, *scales, *opacities, *colours;
   float* extras;          // or null
   float* offsets;         // or null
@@ -246,55 +346,62 @@ struct Camera {
   }
 };
 
-SX_INLINE float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-// Everything between a Gaussian and its ellipse on the image; the backward pass recomputes it.
-struct Projection {
-  float p[3];                // mean in the camera frame
-  float inv_z, rx, ry;       // 1/z, clamped x/z and y/z
-  bool x_free, y_free;       // not clamped
-  float q[4], inv_norm;      // unit quaternion, 1/length of the given one
-  float rot[9];              // world_from_gaussian
-  float a[9];                // cam_from_gaussian, scaled: R * rot * diag(s)
-  float j00, j02, j11, j12;  // Jacobian
-  float v0[3], v1[3];        // rows of J * a: cov = v v^T
-  float xx, xy, yy;          // covariance before the blur
-  float det0, det1;          // determinants before and after the blur
-  float bx, by;              // diagonal after the blur
-  float compensation;        // of the opacity, antialiased mode
-  float opacity;             // compensated
-  float u, v;                // mean on the image
-};
-
-SX_INLINE void rotation_from_quat(const float* q, float* m) {
-  const float w = q[0], x = q[1], y = q[2], z = q[3];
-  m[0] = 1 - 2 * (y * y + z * z), m[1] = 2 * (x * y - w * z), m[2] = 2 * (x * z + w * y);
-  m[3] = 2 * (x * y + w * z), m[4] = 1 - 2 * (x * x + z * z), m[5] = 2 * (y * z - w * x);
-  m[6] = 2 * (x * z - w * y), m[7] = 2 * (y * z + w * x), m[8] = 1 - 2 * (x * x + y * y);
+template <class A, class B>
+SX_INLINE B dot3(const A* a, const B* b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-// False where the Gaussian cannot be seen. Tests are written so that NaN fails them.
-SX_INLINE bool project(const SxScene& s, const Camera& cam, int64_t g, Projection& o) {
-  const float* m = s.means + 3 * g;
-  for (int i = 0; i < 3; ++i) o.p[i] = dot3(cam.r + 3 * i, m) + cam.t[i];
-  const float z = o.p[2];
-  if (!(z > s.near_plane) || !(z < s.far_plane)) return false;
-  if (!(s.opacities[g] >= kMinAlpha)) return false;
+// Everything between kLanes Gaussians, one per lane, and their ellipses on the image; the backward pass recomputes it.
+struct Projection {
+  Vec m[3], scale[3];      // as given
+  Vec p[3];                // mean in the camera frame
+  Vec inv_z, rx, ry;       // 1/z, clamped x/z and y/z
+  Mask x_free, y_free;     // not clamped
+  Vec q[4], inv_norm;      // unit quaternion, 1/length of the given one
+  Vec rot[9];              // world_from_gaussian
+  Vec a[9];                // cam_from_gaussian, scaled: R * rot * diag(s)
+  Vec j00, j02, j11, j12;  // Jacobian
+  Vec v0[3], v1[3];        // rows of J * a: cov = v v^T
+  Vec xx, xy, yy;          // covariance before the blur
+  Vec det0, det1;          // determinants before and after the blur
+  Vec bx, by;              // diagonal after the blur
+  Vec given_opacity;
+  Vec compensation;        // of the opacity, antialiased mode
+  Vec opacity;             // compensated
+  Vec u, v;                // mean on the image
+};
 
-  const float* q = s.quats + 4 * g;
-  o.inv_norm = 1.0f / std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  for (int i = 0; i < 4; ++i) o.q[i] = q[i] * o.inv_norm;
+SX_INLINE void rotation_from_quat(const Vec* q, Vec* m) {
+  const Vec w = q[0], x = q[1], y = q[2], z = q[3];
+  m[0] = 1.0f - 2.0f * (y * y + z * z), m[1] = 2.0f * (x * y - w * z), m[2] = 2.0f * (x * z + w * y);
+  m[3] = 2.0f * (x * y + w * z), m[4] = 1.0f - 2.0f * (x * x + z * z), m[5] = 2.0f * (y * z - w * x);
+  m[6] = 2.0f * (x * z - w * y), m[7] = 2.0f * (y * z + w * x), m[8] = 1.0f - 2.0f * (x * x + y * y);
+}
+
+// Of the Gaussians from g on, which can be seen; the lanes of others mean nothing. Tests are written so that NaN fails them.
+SX_INLINE Mask project(const SxScene& s, const Camera& cam, int64_t g, Projection& o) {
+  const int n = static_cast<int>(std::min<int64_t>(s.count - g, kLanes));
+  load_rows<3>(s.means + 3 * g, n, o.m);
+  load_rows<1>(s.opacities + g, n, &o.given_opacity);
+  for (int i = 0; i < 3; ++i) o.p[i] = dot3(cam.r + 3 * i, o.m) + cam.t[i];
+  const Vec z = o.p[2];
+  Mask seen = (z > s.near_plane) & (z < s.far_plane) & (o.given_opacity >= kMinAlpha);
+  if (!any(seen)) return seen;
+
+  load_rows<4>(s.quats + 4 * g, n, o.q);
+  o.inv_norm = 1.0f / sqrt_vec(o.q[0] * o.q[0] + o.q[1] * o.q[1] + o.q[2] * o.q[2] + o.q[3] * o.q[3]);
+  for (int i = 0; i < 4; ++i) o.q[i] *= o.inv_norm;
   rotation_from_quat(o.q, o.rot);
-  const float* scale = s.scales + 3 * g;
+  load_rows<3>(s.scales + 3 * g, n, o.scale);
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j)
       o.a[3 * i + j] =
-          (cam.r[3 * i] * o.rot[j] + cam.r[3 * i + 1] * o.rot[3 + j] + cam.r[3 * i + 2] * o.rot[6 + j]) * scale[j];
+          (cam.r[3 * i] * o.rot[j] + cam.r[3 * i + 1] * o.rot[3 + j] + cam.r[3 * i + 2] * o.rot[6 + j]) * o.scale[j];
 
   o.inv_z = 1.0f / z;
-  const float x_ratio = o.p[0] * o.inv_z, y_ratio = o.p[1] * o.inv_z;
-  o.rx = std::min(std::max(x_ratio, cam.x_low), cam.x_high);
-  o.ry = std::min(std::max(y_ratio, cam.y_low), cam.y_high);
+  const Vec x_ratio = o.p[0] * o.inv_z, y_ratio = o.p[1] * o.inv_z;
+  o.rx = min_vec(max_vec(x_ratio, splat(cam.x_low)), splat(cam.x_high));
+  o.ry = min_vec(max_vec(y_ratio, splat(cam.y_low)), splat(cam.y_high));
   o.x_free = o.rx == x_ratio, o.y_free = o.ry == y_ratio;
   o.j00 = cam.fx * o.inv_z, o.j02 = -cam.fx * o.rx * o.inv_z;
   o.j11 = cam.fy * o.inv_z, o.j12 = -cam.fy * o.ry * o.inv_z;
@@ -305,19 +412,22 @@ SX_INLINE bool project(const SxScene& s, const Camera& cam, int64_t g, Projectio
   o.xx = dot3(o.v0, o.v0), o.xy = dot3(o.v0, o.v1), o.yy = dot3(o.v1, o.v1);
   o.bx = o.xx + s.eps2d, o.by = o.yy + s.eps2d;
   // |v0 x v1|^2 cannot turn negative, xx * yy - xy^2 can.
-  const float n0 = o.v0[1] * o.v1[2] - o.v0[2] * o.v1[1];
-  const float n1 = o.v0[2] * o.v1[0] - o.v0[0] * o.v1[2];
-  const float n2 = o.v0[0] * o.v1[1] - o.v0[1] * o.v1[0];
+  const Vec n0 = o.v0[1] * o.v1[2] - o.v0[2] * o.v1[1];
+  const Vec n1 = o.v0[2] * o.v1[0] - o.v0[0] * o.v1[2];
+  const Vec n2 = o.v0[0] * o.v1[1] - o.v0[1] * o.v1[0];
   o.det0 = n0 * n0 + n1 * n1 + n2 * n2;
   o.det1 = o.det0 + s.eps2d * (o.xx + o.yy) + s.eps2d * s.eps2d;
-  if (!(o.det1 > kMinDeterminant)) return false;
 
-  o.compensation = s.antialiased ? std::max(kMinCompensation, std::sqrt(o.det0 / o.det1)) : 1.0f;
-  o.opacity = s.opacities[g] * o.compensation;
-  if (!(o.opacity >= kMinAlpha)) return false;
+  o.compensation = splat(1.0f);
+  if (s.antialiased) o.compensation = max_vec(splat(kMinCompensation), sqrt_vec(o.det0 / o.det1));
+  o.opacity = o.given_opacity * o.compensation;
   o.u = cam.fx * x_ratio + cam.cx, o.v = cam.fy * y_ratio + cam.cy;
-  if (s.offsets) o.u += s.offsets[2 * g], o.v += s.offsets[2 * g + 1];
-  return true;
+  if (s.offsets) {
+    Vec offset[2];
+    load_rows<2>(s.offsets + 2 * g, n, offset);
+    o.u += offset[0], o.v += offset[1];
+  }
+  return seen & (o.det1 > kMinDeterminant) & (o.opacity >= kMinAlpha);
 }
 
 // ------------------------------------------------------------------------------------------------ spherical harmonics
@@ -408,6 +518,13 @@ struct Rect {
   uint16_t x0, x1, y0, y1;  // in tiles, end exclusive; empty where culled
 };
 
+SX_INLINE bool is_seen(const Rect& r) { return r.x0 < r.x1; }
+
+// How many of a Gaussian's tiles lie in the tile rows row0 to row1 (exclusive).
+SX_INLINE int64_t tiles_in(const Rect& r, int row0, int row1) {
+  return static_cast<int64_t>(r.x1 - r.x0) * std::max(0, std::min<int>(r.y1, row1) - std::max<int>(r.y0, row0));
+}
+
 struct Bins {  // Gaussians of each tile of a band, in depth order
   int row0 = 0, row1 = 0;
   std::vector<uint64_t> start;
@@ -415,11 +532,12 @@ struct Bins {  // Gaussians of each tile of a band, in depth order
 };
 
 struct View {
-  int64_t count = 0;
+  int64_t count = 0, visible = 0;
+  int64_t pairs = 0;  // of a visible Gaussian and a tile
   int tiles_x = 0, tiles_y = 0, channels = 0;
-  Buffer<Rect> rects;  // by Gaussian
-  std::vector<uint32_t> order;    // visible Gaussians by depth
-  std::vector<Rect> ordered_rects;
+  Buffer<Rect> rects;      // by Gaussian
+  Buffer<uint32_t> order;  // visible Gaussians by depth
+  Buffer<Rect> ordered_rects;
   std::vector<int> bands;  // boundaries in tile rows
   Bins bins;               // kept for the backward pass if there is only one band
   virtual ~View() = default;
@@ -432,81 +550,157 @@ struct ViewOf : View {
 
 int channels_of(const SxScene& s) { return 3 + (s.with_depth ? 1 : 0) + s.extra_channels; }
 
+int64_t chunks_of(int64_t count) { return (count + kChunk - 1) / kChunk; }
+
+// Calls fn(g) for the Gaussians of a chunk.
+template <class Fn>
+SX_INLINE void each_of_chunk(int64_t chunk, int64_t count, const Fn& fn) {
+  for (int64_t g = chunk * kChunk; g < std::min<int64_t>(count, (chunk + 1) * kChunk); ++g) fn(g);
+}
+
+// No more threads than there are units of work.
+int threads_for(const SxScene& s) {
+  const int64_t tiles = static_cast<int64_t>((s.width + kTileW - 1) / kTileW) * ((s.height + kTileH - 1) / kTileH);
+  return static_cast<int>(std::min<int64_t>(s.threads, std::max(tiles, chunks_of(s.count))));
+}
+
+struct DepthKeys {
+  Buffer<uint32_t> key;         // by Gaussian, kCulled where it cannot be seen
+  std::vector<int64_t> before;  // visible Gaussians before each chunk
+  uint32_t least = kCulled, most = 0;
+};
+
+// Of a chunk, so that nobody has to go through all Gaussians alone.
+struct SeenCount {
+  int64_t visible = 0, pairs = 0;
+  uint32_t least = kCulled, most = 0;
+};
+
+// Records, rectangles, depths and radii of the up to kLanes Gaussians from g on.
 template <int NC>
-bool make_record(const SxScene& s, const Camera& cam, int64_t g, Projection& o, Record<NC>& rec, float& radius) {
-  if (!project(s, cam, g, o)) return false;
+void make_records(const SxScene& s, const Camera& cam, int64_t g, ViewOf<NC>& view, uint32_t* keys, float* radii,
+                  SeenCount& count) {
+  const int n = static_cast<int>(std::min<int64_t>(s.count - g, kLanes));
+  std::fill_n(keys + g, n, kCulled);
+  std::fill_n(radii + g, n, 0.0f);
+  std::fill_n(view.rects.get() + g, n, Rect{0, 0, 0, 0});
+  Projection o;
+  Mask seen = project(s, cam, g, o);
+  if (!any(seen)) return;
   // alpha >= 1/255 inside this ellipse only; the margin absorbs rounding.
-  const float extent = 2.0f * std::log(255.0f * o.opacity) + 1e-4f;
-  const float half_w = std::sqrt(extent * o.bx), half_h = std::sqrt(extent * o.by);
-  const float w = static_cast<float>(s.width), h = static_cast<float>(s.height);
-  const float x0 = std::max(std::ceil(o.u - half_w - 0.5f), 0.0f), x1 = std::min(std::floor(o.u + half_w + 0.5f), w);
-  const float y0 = std::max(std::ceil(o.v - half_h - 0.5f), 0.0f), y1 = std::min(std::floor(o.v + half_h + 0.5f), h);
-  if (!(x0 < x1) || !(y0 < y1)) return false;
-  radius = std::max(half_w, half_h);
-  const float k = -0.5f * kLog2E / o.det1;
-  rec.u = o.u, rec.v = o.v;
-  rec.qa = k * o.by, rec.qb = -2.0f * k * o.xy, rec.qc = k * o.bx;
-  rec.level = std::log2(o.opacity);
-  rec.x0 = static_cast<int16_t>(x0), rec.x1 = static_cast<int16_t>(x1);
-  rec.y0 = static_cast<int16_t>(y0), rec.y1 = static_cast<int16_t>(y1);
-  std::fill(rec.feature, rec.feature + NC, 0.0f);
-  shade(s, cam, g, rec.feature);
-  float* rest = rec.feature + 3;
-  if (s.with_depth) *rest++ = o.p[2];
-  if (s.extra_channels) std::copy_n(s.extras + g * s.extra_channels, s.extra_channels, rest);
-  return true;
+  const Vec opacity = seen ? o.opacity : splat(1.0f);  // logarithms of lanes that mean nothing may be slow
+  const Vec extent = 2.0f * each_lane(255.0f * opacity, [](float x) { return std::log(x); }) + 1e-4f;
+  const Vec level = each_lane(opacity, [](float x) { return std::log2(x); });
+  const Vec half_w = sqrt_vec(extent * o.bx), half_h = sqrt_vec(extent * o.by);
+  const Vec w = splat(static_cast<float>(s.width)), h = splat(static_cast<float>(s.height));
+  const Vec x0 = max_vec(ceil_vec(o.u - half_w - 0.5f), Vec{}), x1 = min_vec(floor_vec(o.u + half_w + 0.5f), w);
+  const Vec y0 = max_vec(ceil_vec(o.v - half_h - 0.5f), Vec{}), y1 = min_vec(floor_vec(o.v + half_h + 0.5f), h);
+  seen &= (x0 < x1) & (y0 < y1);
+  const Vec radius = max_vec(half_w, half_h);
+  const Vec k = -0.5f * kLog2E / o.det1;
+  const Vec qa = k * o.by, qb = -2.0f * k * o.xy, qc = k * o.bx;
+  for (int lane = 0; lane < n; ++lane) {
+    if (!seen[lane]) continue;
+    const int64_t at = g + lane;
+    const float z = o.p[2][lane];
+    Record<NC>& rec = view.records[at];
+    rec.u = o.u[lane], rec.v = o.v[lane];
+    rec.qa = qa[lane], rec.qb = qb[lane], rec.qc = qc[lane];
+    rec.level = level[lane];
+    rec.x0 = static_cast<int16_t>(x0[lane]), rec.x1 = static_cast<int16_t>(x1[lane]);
+    rec.y0 = static_cast<int16_t>(y0[lane]), rec.y1 = static_cast<int16_t>(y1[lane]);
+    std::fill(rec.feature, rec.feature + NC, 0.0f);
+    shade(s, cam, at, rec.feature);
+    float* rest = rec.feature + 3;
+    if (s.with_depth) *rest++ = z;
+    if (s.extra_channels) std::copy_n(s.extras + at * s.extra_channels, s.extra_channels, rest);
+    radii[at] = radius[lane];
+    const Rect rect{static_cast<uint16_t>(rec.x0 / kTileW), static_cast<uint16_t>((rec.x1 - 1) / kTileW + 1),
+                    static_cast<uint16_t>(rec.y0 / kTileH), static_cast<uint16_t>((rec.y1 - 1) / kTileH + 1)};
+    view.rects[at] = rect;
+    std::memcpy(&keys[at], &z, sizeof z);  // positive floats order like their bits
+    count.visible += 1, count.pairs += tiles_in(rect, 0, view.tiles_y);
+    count.least = std::min(count.least, keys[at]), count.most = std::max(count.most, keys[at]);
+  }
 }
 
 template <int NC>
-void project_all(const SxScene& s, const Camera& cam, ViewOf<NC>& view, uint32_t* keys, float* radii) {
-  const int64_t chunks = (s.count + kChunk - 1) / kChunk;
-  parallel_for(s.threads, chunks, [&](int64_t chunk) {
-    Projection o;
-    for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); ++g) {
-      Record<NC>& rec = view.records[g];
-      keys[g] = kCulled;
-      radii[g] = 0.0f;
-      view.rects[g] = Rect{0, 0, 0, 0};
-      if (!make_record<NC>(s, cam, g, o, rec, radii[g])) continue;
-      std::memcpy(&keys[g], &o.p[2], sizeof(float));  // positive floats order like their bits
-      view.rects[g] = Rect{static_cast<uint16_t>(rec.x0 / kTileW), static_cast<uint16_t>((rec.x1 - 1) / kTileW + 1),
-                           static_cast<uint16_t>(rec.y0 / kTileH), static_cast<uint16_t>((rec.y1 - 1) / kTileH + 1)};
+void project_all(const SxScene& s, Team& team, const Camera& cam, ViewOf<NC>& view, DepthKeys& keys, float* radii) {
+  std::vector<SeenCount> counts(chunks_of(s.count));
+  keys.key = uninitialised<uint32_t>(s.count);
+  team.run(chunks_of(s.count), [&](int64_t chunk) {
+    SeenCount own;
+    for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); g += kLanes)
+      make_records<NC>(s, cam, g, view, keys.key.get(), radii, own);
+    counts[chunk] = own;
+  });
+  keys.before.reserve(counts.size());
+  for (const SeenCount& part : counts) {
+    keys.before.push_back(view.visible);
+    view.visible += part.visible, view.pairs += part.pairs;
+    keys.least = std::min(keys.least, part.least), keys.most = std::max(keys.most, part.most);
+  }
+}
+
+// Stable radix sort of the visible Gaussians by key, in digits of equal width from the lowest. Each part of the list counts, then
+// writes behind the parts before it: there is only one stable order, so the number of parts does not show.
+void order_by_depth(Team& team, const DepthKeys& keys, View& view) {
+  struct Item {
+    uint32_t key, index;
+  };
+  auto items = uninitialised<Item>(view.visible), other = uninitialised<Item>(view.visible);
+  team.run(chunks_of(view.count), [&](int64_t chunk) {
+    Item* next = items.get() + keys.before[chunk];
+    each_of_chunk(chunk, view.count, [&](int64_t g) {
+      if (keys.key[g] != kCulled) *next++ = {keys.key[g] - keys.least, static_cast<uint32_t>(g)};
+    });
+  });
+  const uint32_t spread = view.visible > 0 ? keys.most - keys.least : 0;
+  int bits = 0;  // of the spread
+  while (bits < 32 && spread >> bits != 0) ++bits;
+  const int passes = (bits + kDigitBits - 1) / kDigitBits;
+  const int width = passes > 0 ? (bits + passes - 1) / passes : 0;
+  const uint32_t digits = 1u << width;
+  const int64_t parts = team.parts();
+  auto range = [&](int64_t part) { return part * view.visible / parts; };
+  std::vector<uint32_t> cursor(parts * digits);
+  for (int shift = 0; shift < bits; shift += width) {
+    auto digit = [&](const Item& item) { return item.key >> shift & (digits - 1); };
+    team.run(parts, [&](int64_t part) {
+      uint32_t* mine = cursor.data() + part * digits;
+      std::fill(mine, mine + digits, 0);
+      for (int64_t i = range(part); i < range(part + 1); ++i) ++mine[digit(items[i])];
+    });
+    uint32_t total = 0;
+    for (uint32_t d = 0; d < digits; ++d)
+      for (int64_t part = 0; part < parts; ++part) total += std::exchange(cursor[part * digits + d], total);
+    team.run(parts, [&](int64_t part) {
+      uint32_t* mine = cursor.data() + part * digits;
+      for (int64_t i = range(part); i < range(part + 1); ++i) other[mine[digit(items[i])]++] = items[i];
+    });
+    items.swap(other);
+  }
+  view.order = uninitialised<uint32_t>(view.visible);
+  view.ordered_rects = uninitialised<Rect>(view.visible);
+  team.run(parts, [&](int64_t part) {
+    for (int64_t i = range(part); i < range(part + 1); ++i) {
+      view.order[i] = items[i].index;
+      view.ordered_rects[i] = view.rects[items[i].index];
     }
   });
 }
 
-// Stable radix sort of the visible Gaussians by key, 11 bits at a time; a digit that all keys share costs one count only.
-void order_by_depth(int64_t count, const uint32_t* keys, View& view) {
-  struct Item {
-    uint32_t key, index;
-  };
-  std::vector<Item> items, other;
-  items.reserve(count);
-  for (int64_t g = 0; g < count; ++g)
-    if (keys[g] != kCulled) items.push_back({keys[g], static_cast<uint32_t>(g)});
-  other.resize(items.size());
-  for (int shift = 0; shift < 32; shift += 11) {
-    std::vector<size_t> start(2049, 0);
-    for (const Item& item : items) ++start[((item.key >> shift) & 2047) + 1];
-    if (std::find(start.begin(), start.end(), items.size()) != start.end() && !items.empty()) continue;
-    for (int i = 0; i < 2048; ++i) start[i + 1] += start[i];
-    for (const Item& item : items) other[start[(item.key >> shift) & 2047]++] = item;
-    items.swap(other);
-  }
-  view.order.resize(items.size());
-  view.ordered_rects.resize(items.size());
-  for (size_t i = 0; i < items.size(); ++i) {
-    view.order[i] = items[i].index;
-    view.ordered_rects[i] = view.rects[items[i].index];
-  }
-}
-
 // Greedy bands of whole tile rows, each within the budget where a single row is.
 void choose_bands(const SxScene& s, View& view) {
-  std::vector<int64_t> change(view.tiles_y + 1, 0);
-  for (const Rect& r : view.ordered_rects) change[r.y0] += r.x1 - r.x0, change[r.y1] -= r.x1 - r.x0;
   const int64_t budget = s.band_bytes / static_cast<int64_t>(sizeof(float) * (1 + kMoments + channels_of(s)));
-  view.bands.assign(1, 0);
+  view.bands = {0, view.tiles_y};
+  if (view.pairs <= budget) return;
+  std::vector<int64_t> change(view.tiles_y + 1, 0);
+  for (int64_t i = 0; i < view.visible; ++i) {
+    const Rect& r = view.ordered_rects[i];
+    change[r.y0] += r.x1 - r.x0, change[r.y1] -= r.x1 - r.x0;
+  }
+  view.bands = {0};
   int64_t in_row = 0, in_band = 0;
   for (int row = 0; row < view.tiles_y; ++row) {
     in_row += change[row];
@@ -516,23 +710,32 @@ void choose_bands(const SxScene& s, View& view) {
   view.bands.push_back(view.tiles_y);
 }
 
+// Calls fn(tile, 1) for the tiles of a Gaussian in a band, and fn(tile, 0) for some of them again: most have one or two columns
+// and rows, at random, and loops would be guessed wrong about every other time.
 template <class Fn>
 SX_INLINE void each_tile(const Rect& r, int row0, int row1, int tiles_x, const Fn& fn) {
-  for (int y = std::max<int>(r.y0, row0); y < std::min<int>(r.y1, row1); ++y)
-    for (int x = r.x0; x < r.x1; ++x) fn((y - row0) * tiles_x + x);
+  const int y0 = std::max<int>(r.y0, row0) - row0, y1 = std::min<int>(r.y1, row1) - row0;
+  const int right = r.x1 - r.x0 - 1, down = y1 - y0 - 1;
+  if (down < 0) return;
+  if (right <= 1 && down <= 1) {
+    const int above = y0 * tiles_x + r.x0, below = above + down * tiles_x;
+    fn(above, 1), fn(above + right, right), fn(below, down), fn(below + right, right & down);
+    return;
+  }
+  for (int y = y0; y < y1; ++y)
+    for (int x = r.x0; x < r.x1; ++x) fn(y * tiles_x + x, 1);
 }
 
 // Stable counting sort: each part of the depth order counts, then writes behind the parts before it.
-void fill_bins(const View& view, int threads, int row0, int row1, Bins& bins) {
+void fill_bins(const View& view, Team& team, int row0, int row1, Bins& bins) {
   const int64_t tiles = static_cast<int64_t>(row1 - row0) * view.tiles_x;
-  const int64_t visible = static_cast<int64_t>(view.order.size());
-  const int64_t parts = std::max(1, threads);
+  const int64_t parts = team.parts();
   std::vector<uint64_t> cursor(parts * tiles, 0);
-  auto range = [&](int64_t part) { return part * visible / parts; };
-  parallel_for(threads, parts, [&](int64_t part) {
+  auto range = [&](int64_t part) { return part * view.visible / parts; };
+  team.run(parts, [&](int64_t part) {
     uint64_t* mine = cursor.data() + part * tiles;
     for (int64_t i = range(part); i < range(part + 1); ++i)
-      each_tile(view.ordered_rects[i], row0, row1, view.tiles_x, [&](int tile) { ++mine[tile]; });
+      each_tile(view.ordered_rects[i], row0, row1, view.tiles_x, [&](int tile, int is_new) { mine[tile] += is_new; });
   });
   bins.row0 = row0, bins.row1 = row1;
   bins.start.assign(tiles + 1, 0);
@@ -547,11 +750,14 @@ void fill_bins(const View& view, int threads, int row0, int row1, Bins& bins) {
   }
   bins.start[tiles] = total;
   bins.entries = uninitialised<uint32_t>(total);
-  parallel_for(threads, parts, [&](int64_t part) {
+  team.run(parts, [&](int64_t part) {
     uint64_t* mine = cursor.data() + part * tiles;
+    uint32_t* entries = bins.entries.get();
     for (int64_t i = range(part); i < range(part + 1); ++i)
-      each_tile(view.ordered_rects[i], row0, row1, view.tiles_x,
-                [&](int tile) { bins.entries[mine[tile]++] = view.order[i]; });
+      each_tile(view.ordered_rects[i], row0, row1, view.tiles_x, [&](int tile, int is_new) {
+        mine[tile] += is_new;
+        entries[mine[tile] - 1] = view.order[i];  // once more the same, unless it is new
+      });
   });
 }
 
@@ -658,6 +864,7 @@ void blend_tile(const SxScene& s, const Record<NC>* records, const uint32_t* ent
 
 template <int NC>
 View* forward(const SxScene& s, float* planes, float* transmittance, float* radii) {
+  Team team(threads_for(s));
   auto view = std::make_unique<ViewOf<NC>>();
   view->count = s.count;
   view->channels = NC;
@@ -665,16 +872,16 @@ View* forward(const SxScene& s, float* planes, float* transmittance, float* radi
   view->records = uninitialised<Record<NC>>(s.count);
   view->rects = uninitialised<Rect>(s.count);
   {
-    auto keys = uninitialised<uint32_t>(s.count);
-    project_all<NC>(s, Camera(s), *view, keys.get(), radii);
-    order_by_depth(s.count, keys.get(), *view);
+    DepthKeys keys;
+    project_all<NC>(s, team, Camera(s), *view, keys, radii);
+    order_by_depth(team, keys, *view);
   }
   choose_bands(s, *view);
   for (size_t band = 0; band + 1 < view->bands.size(); ++band) {
     const int row0 = view->bands[band], row1 = view->bands[band + 1];
-    fill_bins(*view, s.threads, row0, row1, view->bins);
+    fill_bins(*view, team, row0, row1, view->bins);
     const Bins& bins = view->bins;
-    parallel_for(s.threads, static_cast<int64_t>(row1 - row0) * view->tiles_x, [&](int64_t tile) {
+    team.run(static_cast<int64_t>(row1 - row0) * view->tiles_x, [&](int64_t tile) {
       const TileArea area =
           tile_area(s, static_cast<int>(tile % view->tiles_x), row0 + static_cast<int>(tile / view->tiles_x));
       blend_tile<NC>(s, view->records.get(), bins.entries.get() + bins.start[tile],
@@ -776,16 +983,16 @@ struct CameraSums {
   double r[9] = {}, t[3] = {};
 };
 
-void quat_backward(const Projection& o, const float* d, float* out) {  // d: dL/d(rotation matrix)
-  const float w = o.q[0], x = o.q[1], y = o.q[2], z = o.q[3];
-  const float dq[4] = {
-      2 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
-      2 * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - 2 * x * (d[4] + d[8])),
-      2 * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2 * y * (d[0] + d[8])),
-      2 * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2 * z * (d[0] + d[4])),
+SX_INLINE void quat_backward(const Projection& o, const Vec* d, Vec* out) {  // d: dL/d(rotation matrix)
+  const Vec w = o.q[0], x = o.q[1], y = o.q[2], z = o.q[3];
+  const Vec dq[4] = {
+      2.0f * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
+      2.0f * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - 2.0f * x * (d[4] + d[8])),
+      2.0f * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2.0f * y * (d[0] + d[8])),
+      2.0f * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2.0f * z * (d[0] + d[4])),
   };
-  const float along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;  // the length of a quaternion has no effect
-  for (int i = 0; i < 4; ++i) out[i] += (dq[i] - along * o.q[i]) * o.inv_norm;
+  const Vec along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;  // the length of a quaternion has no effect
+  for (int i = 0; i < 4; ++i) out[i] = (dq[i] - along * o.q[i]) * o.inv_norm;
 }
 
 // dL/dmean (world) and dL/d(camera position) are opposite: returns the former.
@@ -812,106 +1019,134 @@ void shade_backward(const SxScene& s, const Camera& cam, int64_t g, const float*
   for (int i = 0; i < 3; ++i) d_mean[i] = (d_dir[i] - along * dir.d[i]) * dir.inv_length;
 }
 
-// Carries the summed slot of one Gaussian through its projection.
-void project_backward(const SxScene& s, const Camera& cam, int64_t g, const float* sums, const float* colour,
-                      const SxGradients& grad, CameraSums& cam_sums) {
+void clear_gradients(const SxScene& s, const SxGradients& grad, int64_t chunk) {
+  const int64_t first = chunk * kChunk, rows = std::min<int64_t>(s.count - first, kChunk);
+  auto clear = [&](float* all, int64_t width) {
+    if (all) std::fill_n(all + first * width, rows * width, 0.0f);
+  };
+  clear(grad.extras, s.extra_channels), clear(grad.offsets, 2);
+  if (grad.add) return;
+  clear(grad.means, 3), clear(grad.quats, 4), clear(grad.scales, 3), clear(grad.opacities, 1);
+  clear(grad.colours, 3 * std::max(1, s.sh_coefficients));
+}
+
+// Carries the summed slots of the up to kLanes Gaussians from g on through their projection.
+template <int NC>
+void project_backward(const SxScene& s, const Camera& cam, const ViewOf<NC>& view, int64_t g,
+                      const float (*slots)[kMoments + NC], const SxGradients& grad, CameraSums& cam_sums) {
+  const int n = static_cast<int>(std::min<int64_t>(s.count - g, kLanes));
+  const Rect* rects = view.rects.get() + g;
   Projection o;
-  if (!project(s, cam, g, o)) return;
+  if (!any(project(s, cam, g, o))) return;
+  Vec sums[kMoments + NC];
+  load_rows<kMoments + NC>(slots[0], n, sums);
   // Conic (a, b, c) of the blurred covariance, and the mean: sigma = a dx^2 / 2 + b dx dy + c dy^2 / 2, d = pixel - mean.
-  const float a = o.by / o.det1, b = -o.xy / o.det1, c = o.bx / o.det1;
-  const float d_u = a * sums[1] + b * sums[2], d_v = b * sums[1] + c * sums[2];
-  if (grad.offsets) grad.offsets[2 * g] += d_u, grad.offsets[2 * g + 1] += d_v;
-  const float da = -0.5f * sums[3], half_db = -0.5f * sums[4], dc = -0.5f * sums[5];
+  const Vec a = o.by / o.det1, b = -o.xy / o.det1, c = o.bx / o.det1;
+  const Vec d_u = a * sums[1] + b * sums[2], d_v = b * sums[1] + c * sums[2];
+  const Vec da = -0.5f * sums[3], half_db = -0.5f * sums[4], dc = -0.5f * sums[5];
   // d(covariance) = -Q dQ Q.
-  const float h00 = a * da + b * half_db, h01 = a * half_db + b * dc;
-  const float h10 = b * da + c * half_db, h11 = b * half_db + c * dc;
-  float d_xx = -(h00 * a + h01 * b), d_xy = -2.0f * (h00 * b + h01 * c), d_yy = -(h10 * b + h11 * c);
-  const float d_opacity = sums[0] / o.opacity;  // of the compensated opacity
-  grad.opacities[g] += d_opacity * o.compensation;
-  if (s.antialiased && o.compensation > kMinCompensation) {
-    const float d_ratio = d_opacity * s.opacities[g] * 0.5f / o.compensation;
-    const float d_det0 = d_ratio / o.det1, d_det1 = -d_ratio * o.det0 / (o.det1 * o.det1);
+  const Vec h00 = a * da + b * half_db, h01 = a * half_db + b * dc;
+  const Vec h10 = b * da + c * half_db, h11 = b * half_db + c * dc;
+  Vec d_xx = -(h00 * a + h01 * b), d_xy = -2.0f * (h00 * b + h01 * c), d_yy = -(h10 * b + h11 * c);
+  const Vec d_compensated = sums[0] / o.opacity;
+  const Vec d_opacity = d_compensated * o.compensation;
+  if (s.antialiased) {
+    const Vec d_ratio = keep(o.compensation > kMinCompensation, d_compensated * o.given_opacity * 0.5f / o.compensation);
+    const Vec d_det0 = d_ratio / o.det1, d_det1 = -d_ratio * o.det0 / (o.det1 * o.det1);
     d_xx += d_det0 * o.yy + d_det1 * o.by, d_yy += d_det0 * o.xx + d_det1 * o.bx;
     d_xy -= 2.0f * o.xy * (d_det0 + d_det1);
   }
-  float d_a[9], d_j00 = 0, d_j02 = 0, d_j11 = 0, d_j12 = 0;
+  Vec d_a[9], d_j00{}, d_j02{}, d_j11{}, d_j12{};
   for (int j = 0; j < 3; ++j) {
-    const float d_v0 = 2 * d_xx * o.v0[j] + d_xy * o.v1[j], d_v1 = d_xy * o.v0[j] + 2 * d_yy * o.v1[j];
+    const Vec d_v0 = 2.0f * d_xx * o.v0[j] + d_xy * o.v1[j], d_v1 = d_xy * o.v0[j] + 2.0f * d_yy * o.v1[j];
     d_a[j] = o.j00 * d_v0, d_a[3 + j] = o.j11 * d_v1, d_a[6 + j] = o.j02 * d_v0 + o.j12 * d_v1;
     d_j00 += o.a[j] * d_v0, d_j02 += o.a[6 + j] * d_v0;
     d_j11 += o.a[3 + j] * d_v1, d_j12 += o.a[6 + j] * d_v1;
   }
-  const float iz = o.inv_z;
-  float d_p[3] = {d_u * o.j00, d_v * o.j11, 0};
-  d_p[2] = -(d_u * o.j00 * o.p[0] + d_v * o.j11 * o.p[1]) * iz;
+  const Vec iz = o.inv_z;
+  Vec d_p[3] = {d_u * o.j00, d_v * o.j11, -(d_u * o.j00 * o.p[0] + d_v * o.j11 * o.p[1]) * iz};
   d_p[2] -= iz * (d_j00 * o.j00 + d_j02 * o.j02 + d_j11 * o.j11 + d_j12 * o.j12);
-  if (o.x_free) d_p[0] -= d_j02 * o.j00 * iz, d_p[2] += d_j02 * o.j00 * o.rx * iz;
-  if (o.y_free) d_p[1] -= d_j12 * o.j11 * iz, d_p[2] += d_j12 * o.j11 * o.ry * iz;
-  int channel = kMoments + 3;
-  if (s.with_depth) d_p[2] += sums[channel++];
-  for (int e = 0; e < s.extra_channels; ++e)
-    if (grad.extras) grad.extras[g * s.extra_channels + e] += sums[channel + e];
+  d_p[0] -= keep(o.x_free, d_j02 * o.j00 * iz), d_p[2] += keep(o.x_free, d_j02 * o.j00 * o.rx * iz);
+  d_p[1] -= keep(o.y_free, d_j12 * o.j11 * iz), d_p[2] += keep(o.y_free, d_j12 * o.j11 * o.ry * iz);
+  if constexpr (NC > 3)
+    if (s.with_depth) d_p[2] += sums[kMoments + 3];
 
-  const float* scale = s.scales + 3 * g;
-  float d_rot[9], d_scale[3] = {};
+  Vec d_rot[9], d_scale[3] = {}, d_quat[4];
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) {
-      const float d_m = cam.r[i] * d_a[j] + cam.r[3 + i] * d_a[3 + j] + cam.r[6 + i] * d_a[6 + j];
+      const Vec d_m = cam.r[i] * d_a[j] + cam.r[3 + i] * d_a[3 + j] + cam.r[6 + i] * d_a[6 + j];
       d_scale[j] += o.rot[3 * i + j] * d_m;
-      d_rot[3 * i + j] = d_m * scale[j];
+      d_rot[3 * i + j] = d_m * o.scale[j];
     }
-  for (int j = 0; j < 3; ++j) grad.scales[3 * g + j] += d_scale[j];
-  quat_backward(o, d_rot, grad.quats + 4 * g);
+  quat_backward(o, d_rot, d_quat);
 
-  const float* m = s.means + 3 * g;
-  float d_seen[3] = {0, 0, 0};  // dL/dmean through the viewing direction
-  shade_backward(s, cam, g, colour, sums + kMoments, grad.colours, d_seen);
-  for (int i = 0; i < 3; ++i)
-    grad.means[3 * g + i] += cam.r[i] * d_p[0] + cam.r[3 + i] * d_p[1] + cam.r[6 + i] * d_p[2] + d_seen[i];
+  Vec d_seen[3] = {};  // dL/dmean through the viewing direction
+  for (int lane = 0; lane < n; ++lane) {
+    if (!is_seen(rects[lane])) continue;
+    float d[3] = {};
+    shade_backward(s, cam, g + lane, view.records[g + lane].feature, slots[lane] + kMoments, grad.colours, d);
+    for (int i = 0; i < 3; ++i) d_seen[i][lane] = d[i];
+  }
+  Vec d_mean[3], d_t[3], d_r[9];
   for (int i = 0; i < 3; ++i) {
-    cam_sums.t[i] += d_p[i] + dot3(cam.r + 3 * i, d_seen);  // camera position = -R^T t moves against the mean
+    d_mean[i] = cam.r[i] * d_p[0] + cam.r[3 + i] * d_p[1] + cam.r[6 + i] * d_p[2] + d_seen[i];
+    d_t[i] = d_p[i] + dot3(cam.r + 3 * i, d_seen);  // camera position = -R^T t moves against the mean
     for (int j = 0; j < 3; ++j) {
-      float d_r = d_p[i] * m[j] + cam.t[i] * d_seen[j];
-      for (int k = 0; k < 3; ++k) d_r += d_a[3 * i + k] * scale[k] * o.rot[3 * j + k];
-      cam_sums.r[3 * i + j] += d_r;
+      d_r[3 * i + j] = d_p[i] * o.m[j] + cam.t[i] * d_seen[j];
+      for (int k = 0; k < 3; ++k) d_r[3 * i + j] += d_a[3 * i + k] * o.scale[k] * o.rot[3 * j + k];
     }
+  }
+
+  for (int lane = 0; lane < n; ++lane) {
+    if (!is_seen(rects[lane])) continue;
+    const int64_t at = g + lane;
+    const float* extras = slots[lane] + kMoments + 3 + s.with_depth;
+    for (int i = 0; i < 3; ++i) grad.means[3 * at + i] += d_mean[i][lane], grad.scales[3 * at + i] += d_scale[i][lane];
+    for (int i = 0; i < 4; ++i) grad.quats[4 * at + i] += d_quat[i][lane];
+    grad.opacities[at] += d_opacity[lane];
+    if (grad.offsets) grad.offsets[2 * at] += d_u[lane], grad.offsets[2 * at + 1] += d_v[lane];
+    if (grad.extras)
+      for (int e = 0; e < s.extra_channels; ++e) grad.extras[at * s.extra_channels + e] += extras[e];
+    for (int i = 0; i < 9; ++i) cam_sums.r[i] += d_r[i][lane];
+    for (int i = 0; i < 3; ++i) cam_sums.t[i] += d_t[i][lane];
   }
 }
 
 template <int NC>
 void backward(const SxScene& s, View& base, const Upstream& up, const SxGradients& grad) {
   constexpr int kSlot = kMoments + NC;
+  Team team(threads_for(s));
   auto& view = static_cast<ViewOf<NC>&>(base);
   const bool banded = view.bands.size() > 2;
-  const int64_t chunks = (s.count + kChunk - 1) / kChunk;
+  const int64_t chunks = chunks_of(s.count);
   std::vector<float> carried(banded ? s.count * kSlot : 0, 0.0f);  // sums of the bands so far
-  std::vector<uint64_t> offset(s.count + 1);
+  auto offset = uninitialised<uint64_t>(s.count);                  // of a Gaussian's slots from its chunk's first
+  std::vector<uint64_t> chunk_offset(chunks);
   Buffer<float> slots;
-  auto add_slots = [&](int64_t g, float* sums) {
-    for (uint64_t slot = offset[g]; slot < offset[g + 1]; ++slot)
-      for (int k = 0; k < kSlot; ++k) sums[k] += slots[slot * kSlot + k];
-  };
-  auto each_gaussian = [&](const auto& fn) {
-    parallel_for(s.threads, chunks, [&](int64_t chunk) {
-      for (int64_t g = chunk * kChunk; g < std::min<int64_t>(s.count, (chunk + 1) * kChunk); ++g)
-        if (view.rects[g].x0 < view.rects[g].x1) fn(g, chunk);
-    });
+  auto first_slot = [&](int64_t g) { return slots.get() + (chunk_offset[g / kChunk] + offset[g]) * kSlot; };
+  auto add_slots = [&](int64_t g, int row0, int row1, float* sums) {
+    const float* slot = first_slot(g);
+    for (int64_t n = tiles_in(view.rects[g], row0, row1); n > 0; --n, slot += kSlot)
+      for (int k = 0; k < kSlot; ++k) sums[k] += slot[k];
   };
 
   for (size_t band = 0; band + 1 < view.bands.size(); ++band) {
     const int row0 = view.bands[band], row1 = view.bands[band + 1];
     Bins refilled;
-    if (banded) fill_bins(view, s.threads, row0, row1, refilled);
+    if (banded) fill_bins(view, team, row0, row1, refilled);
     const Bins& bins = banded ? refilled : view.bins;
+    team.run(chunks, [&](int64_t chunk) {
+      uint64_t in_chunk = 0;
+      each_of_chunk(chunk, s.count, [&](int64_t g) {
+        offset[g] = in_chunk;
+        in_chunk += tiles_in(view.rects[g], row0, row1);
+      });
+      chunk_offset[chunk] = in_chunk;
+    });
     uint64_t total = 0;
-    for (int64_t g = 0; g < s.count; ++g) {
-      const Rect& r = view.rects[g];
-      offset[g] = total;
-      total += static_cast<uint64_t>(r.x1 - r.x0) * std::max(0, std::min<int>(r.y1, row1) - std::max<int>(r.y0, row0));
-    }
-    offset[s.count] = total;
+    for (uint64_t& in_chunk : chunk_offset) total += std::exchange(in_chunk, total);
     slots = uninitialised<float>(total * kSlot);
-    parallel_for(s.threads, static_cast<int64_t>(row1 - row0) * view.tiles_x, [&](int64_t tile) {
+    team.run(static_cast<int64_t>(row1 - row0) * view.tiles_x, [&](int64_t tile) {
       const int column = static_cast<int>(tile % view.tiles_x), row = row0 + static_cast<int>(tile / view.tiles_x);
       auto fetch = [&](uint32_t g) {
         __builtin_prefetch(&view.records[g]), __builtin_prefetch(&view.rects[g]), __builtin_prefetch(&offset[g]);
@@ -919,25 +1154,33 @@ void backward(const SxScene& s, View& base, const Upstream& up, const SxGradient
       auto slot_of = [&](uint32_t g) {
         const Rect& r = view.rects[g];
         const uint64_t within = static_cast<uint64_t>(row - std::max<int>(r.y0, row0)) * (r.x1 - r.x0) + column - r.x0;
-        return slots.get() + (offset[g] + within) * kSlot;
+        return first_slot(g) + within * kSlot;
       };
       blend_tile_backward<NC>(s, view.records.get(), bins.entries.get() + bins.start[tile],
                               bins.start[tile + 1] - bins.start[tile], tile_area(s, column, row), up, slot_of, fetch);
     });
-    if (banded) each_gaussian([&](int64_t g, int64_t) { add_slots(g, carried.data() + g * kSlot); });
+    if (!banded) break;
+    team.run(chunks, [&](int64_t chunk) {
+      each_of_chunk(chunk, s.count, [&](int64_t g) { add_slots(g, row0, row1, carried.data() + g * kSlot); });
+    });
   }
 
   const Camera cam(s);
   std::vector<CameraSums> cam_sums(chunks);
-  each_gaussian([&](int64_t g, int64_t chunk) {
-    float own[kSlot] = {};
-    float* sums = own;
-    if (banded)
-      sums = carried.data() + g * kSlot;
-    else
-      add_slots(g, own);
-    project_backward(s, cam, g, sums, view.records[g].feature, grad, cam_sums[chunk]);
+  team.run(chunks, [&](int64_t chunk) {
+    clear_gradients(s, grad, chunk);  // here rather than all at once: every thread, and rows that stay in its cache
+    const int64_t end = std::min<int64_t>(s.count, (chunk + 1) * kChunk);
+    for (int64_t g = chunk * kChunk; g < end; g += kLanes) {
+      float sums[kLanes][kSlot] = {};
+      const int64_t n = std::min<int64_t>(end - g, kLanes);
+      if (banded)
+        std::copy_n(carried.data() + g * kSlot, n * kSlot, sums[0]);
+      else
+        for (int64_t lane = 0; lane < n; ++lane) add_slots(g + lane, 0, view.tiles_y, sums[lane]);
+      project_backward<NC>(s, cam, view, g, sums, grad, cam_sums[chunk]);
+    }
   });
+  std::fill_n(grad.cam_from_world, 16, 0.0f);
   CameraSums total;
   for (const CameraSums& part : cam_sums) {
     for (int i = 0; i < 9; ++i) total.r[i] += part.r[i];
@@ -963,7 +1206,7 @@ auto with_channels(int channels, const Fn& fn) {
 
 // ------------------------------------------------------------------------------------------------ entry points
 
-SX_API int32_t sx_abi_version() { return 1; }
+SX_API int32_t sx_abi_version() { return 2; }
 SX_API int32_t sx_max_channels() { return 16; }
 
 // Renders planes [channels,H,W], transmittance [H,W] and radii [N] (pixels, 0: not seen). Returns the view's state for
@@ -977,7 +1220,7 @@ SX_API void* sx_forward(const SxScene* scene, float* planes, float* transmittanc
   }
 }
 
-// Adds to `gradients`, given the outputs of sx_forward for the same scene and the loss's gradients. 0, or 1 if memory ran out.
+// Writes `gradients`, given the outputs of sx_forward for the same scene and the loss's gradients. 0, or 1 if memory ran out.
 SX_API int32_t sx_backward(const SxScene* scene, void* state, const float* planes, const float* transmittance,
                            const float* d_planes, const float* d_alpha, const SxGradients* gradients) {
   try {
