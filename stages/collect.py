@@ -25,6 +25,7 @@ def _round(scene: str, number: int, methods: list[str]) -> RoundSource:
                 splats=layout.packed(scene, number, method),
                 metrics=layout.metrics(scene, number, method),
                 report=layout.reconstruction(scene, number, method).parent / "report.json",
+                refinement=layout.reconstruction(scene, number, method).parent / layout.REFINEMENT,
             )
             for method in methods
         ],

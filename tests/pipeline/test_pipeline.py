@@ -112,6 +112,11 @@ def test_everything_that_was_promised_is_there(finished: Project) -> None:
     for place in re.findall(r'(?:src|poster)="([^"#]+)"', page):
         assert (outputs / "report" / place).is_file(), place
     assert "WorldMirror" not in page
+    assert re.findall(r"looks/(inserted_\d+|depth_\d+)\.jpg", page) == [
+        f"{kind}_{step:04d}" for kind in ("inserted", "depth") for step in (0, 4)
+    ]
+    assert "captured views see" in page or "fits badly" in page, "the verdict on the inserted view"
+    assert len(re.findall(r"Gaussians of [^<]* 4 steps", page)) == 3
     for method in ("captured", "backbone", "sceneexpander"):
         renders = outputs / "room" / "round_1" / "renders" / method
         assert (renders / "rgb.mp4").stat().st_size > 1000

@@ -18,8 +18,9 @@ from sceneexpander.adaptation.consistency import agreement
 from sceneexpander.adaptation.realign import realign
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.lookup import project_to_views, sample_at
 from sceneexpander.geometry.priors import Priors
-from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg, transform_points
+from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,19 +105,13 @@ def _colour_conflict(
     height, width = depth.shape
     points = unproject_to_world(depth[None], intrinsics[-1:], poses[-1:]).reshape(-1, 3)[seen.flatten()]
     own = inserted.flatten(1)[:, seen.flatten()]
+    count = len(images)
     best = torch.full((own.shape[1],), torch.inf, device=own.device)
-    for view in range(len(images)):
-        local = transform_points(rigid_inverse(poses[view]), points)
-        z = local[:, 2]
-        pixel = (local @ intrinsics[view].T)[:, :2] / z.clamp(min=1e-6)[:, None]
-        grid = pixel / pixel.new_tensor([width / 2, height / 2]) - 1
-        inside = (z > 1e-6) & (grid.abs() < 1).all(-1)
+    grids, _, in_frame = project_to_views(points, rigid_inverse(poses[:count]), intrinsics[:count], height, width)
+    for picture, grid, inside in zip(images, grids, in_frame, strict=True):
         if not bool(inside.any()):
             continue
-        there = torch.nn.functional.grid_sample(
-            images[view][None], grid.clamp(-2, 2)[None, :, None], align_corners=False, padding_mode="border"
-        )[0, :, :, 0]
-        difference = there - own
+        difference = sample_at(picture[None], grid[None])[0] - own
         difference = difference - difference[:, inside].mean(1, keepdim=True)
         best = torch.where(inside, torch.minimum(best, difference.abs().mean(0)), best)
     known = best[best.isfinite()]

@@ -15,7 +15,8 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
-from sceneexpander.geometry.rigid import rigid_inverse, transform_points
+from sceneexpander.geometry.lookup import project_to_views, sample_at
+from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.models.protocol import Prediction
 from sceneexpander.splatting import render
 
@@ -207,13 +208,6 @@ def _seen_at(
     mode: str,
 ) -> tuple[Float[Tensor, "view channel point"], Float[Tensor, "view point"], Bool[Tensor, "view point"]]:
     """(views' content where the points project, the points' depth there, whether they are in frame)."""
-    views, _, height, width = content.shape
-    local = transform_points(rigid_inverse(world_from_cam), points_world.expand(views, -1, -1))
-    z = local[..., 2].clamp(min=1e-6)
-    pixel = (local @ intrinsics_px.transpose(-1, -2))[..., :2] / z[..., None]
-    grid = pixel / pixel.new_tensor([width / 2, height / 2]) - 1
-    in_frame = (local[..., 2] > 1e-6) & (grid.abs() < 1).all(-1)
-    sampled = torch.nn.functional.grid_sample(
-        content, grid.clamp(-2, 2)[:, :, None], mode=mode, padding_mode="border", align_corners=False
-    )
-    return sampled[..., 0], z, in_frame
+    height, width = content.shape[-2:]
+    grid, z, in_frame = project_to_views(points_world, rigid_inverse(world_from_cam), intrinsics_px, height, width)
+    return sample_at(content, grid, mode), z, in_frame

@@ -17,6 +17,7 @@ from torch import Tensor
 from sceneexpander.adaptation.config import Realign
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.lookup import grid_of_pixels, sample_at
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg, transform_points
 from sceneexpander.geometry.similarity import align_poses
@@ -163,11 +164,7 @@ def _project(points: Tensor, cam_from_world: Tensor, intrinsics: Tensor) -> tupl
 def _look_up(plane: Tensor, pixel: Tensor) -> Tensor:
     """(channel, point): bilinear samples of a (channel, height, width) map; the border is repeated."""
     height, width = plane.shape[-2:]
-    grid = pixel / pixel.new_tensor([width / 2, height / 2]) - 1
-    sampled = torch.nn.functional.grid_sample(
-        plane[None], grid.clamp(-2, 2)[None, :, None], mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return sampled[0, :, :, 0]
+    return sample_at(plane[None], grid_of_pixels(pixel, height, width).clamp(-2, 2)[None])[0]
 
 
 def _in_frame(points: Tensor, world_from_cam: Tensor, intrinsics: Tensor, depth: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from html import escape
 
 import torch
 from jaxtyping import Float
@@ -41,7 +42,7 @@ def camera_map(reconstruction: Reconstruction) -> str:
         x, y = place(centres[index])
         kind = "new" if bool(reconstruction.generated[index]) else "old"
         parts.append(
-            f'<polygon class="cam {kind}" points="{_cone(reconstruction, index, x, y)}"><title>{_escape(view)}</title></polygon>'
+            f'<polygon class="cam {kind}" points="{_cone(reconstruction, index, x, y)}"><title>{escape(view)}</title></polygon>'
         )
     return "".join([*parts, "</svg>"])
 
@@ -65,7 +66,3 @@ def _cone(reconstruction: Reconstruction, index: int, x: float, y: float) -> str
     corners = [(x, y)]
     corners += [(x + length * math.cos(heading + s * half), y - length * math.sin(heading + s * half)) for s in (-1, 1)]
     return " ".join(f"{px:.1f},{py:.1f}" for px, py in corners)
-
-
-def _escape(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -19,12 +19,14 @@ from sceneexpander.artifacts.store import ArtifactError, read_json, write_bytes_
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.report.camera_map import camera_map
+from sceneexpander.report.course import verdict
 from sceneexpander.report.words import method_words
 from sceneexpander.viewer.packed import PackedSplats
 from sceneexpander.viewer.page import ShownMethod, viewer_page
 
 FACTS = "page.json"
 MAIN_METHOD = "sceneexpander"
+LOOK_PICTURES = ("captured", "inserted", "depth")  # of every look, named with its step
 _PICTURE_SIDE_PX = 720
 _LOSSES = (
     "loss",
@@ -41,7 +43,11 @@ _LOSSES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MethodSource:
-    """Artefacts of one method in one round. ``report``: what its reconstructor says about itself, if it has one of its own."""
+    """Artefacts of one method in one round.
+
+    ``report``: what its reconstructor says about itself, if it has one of its own. ``refinement``: what a fit of its Gaussians to
+    their pictures changed, if there was one.
+    """
 
     name: str
     reconstruction: Path
@@ -49,13 +55,15 @@ class MethodSource:
     splats: Path
     metrics: Path
     report: Path | None = None
+    refinement: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoundSource:
     """Artefacts of one round.
 
-    ``log`` is the adaptation's, with its looks (``looks.json``, ``looks/``) beside it; ``statistics`` holds one file per stage run.
+    ``log`` is the adaptation's, with its looks (``looks.json``, ``looks/``) and the verdict on the inserted view
+    (``acceptance.json``) beside it, where there are any; ``statistics`` holds one file per stage run.
     """
 
     number: int
@@ -153,6 +161,7 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
     spec = scene.round_spec(source.number)
     log = read_json(source.log)
     looks = _looks(source.log.parent, folder, base)
+    acceptance = _read_if_any(source.log.parent / "acceptance.json")
     missing = {item.name: lacking for item in source.methods if (lacking := unavailable_in(item.reconstruction))}
     methods = [_method(item, folder, f"{base}/{item.name}") for item in source.methods if item.name not in missing]
     return {
@@ -182,27 +191,32 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
         ],
         "series": {name: [record[name] for record in log] for name in _LOSSES if log and name in log[0]},
         "looks": looks,
+        "acceptance": acceptance,
         "statistics": _statistics(source.statistics),
-        "warnings": _warnings(methods, chosen.parameters) + (looks["warnings"] if looks else []),
+        "warnings": [
+            *_warnings(methods, chosen.parameters),
+            *([judged.text] if (judged := verdict(acceptance)) is not None and judged.refused else []),
+            *(looks["warnings"] if looks else []),
+        ],
     }
 
 
 def _looks(source: Path, folder: Path, base: str) -> dict[str, Any] | None:
     """What the adaptation saw of itself, with its pictures; None if it never looked."""
-    path = source / "looks.json"
-    facts = read_json(path) if path.is_file() else None
+    facts = _read_if_any(source / "looks.json")
     if facts is None or not facts["looks"]:
         return None
-    pictures = [
-        _copy(picture, folder, f"{base}/looks/{picture.name}") for picture in sorted((source / "looks").glob("*.jpg"))
-    ]
+    entries = []
+    for look in facts["looks"]:
+        names = {kind: f"{kind}_{look['step']:04d}.jpg" for kind in LOOK_PICTURES}
+        pictures = {
+            kind: _copy(source / "looks" / name, folder, f"{base}/looks/{name}")
+            for kind, name in names.items()
+            if (source / "looks" / name).is_file()
+        }
+        entries.append({**look, "pictures": pictures})
     sentences = [f"{text[0].upper()}{text[1:]}." for text in facts["warnings"]]
-    return {
-        "identity": facts["identity"],
-        "entries": facts["looks"],
-        "pictures": pictures,
-        "warnings": sentences,
-    }
+    return {"identity": facts["identity"], "entries": entries, "warnings": sentences}
 
 
 def _method(source: MethodSource, folder: Path, base: str) -> dict[str, Any]:
@@ -231,9 +245,8 @@ def _method(source: MethodSource, folder: Path, base: str) -> dict[str, Any]:
         "name": source.name,
         "model": reconstruction.model,
         "weights_sha256": reconstruction.weights_sha256,
-        "licence": read_json(source.report)["licence"]
-        if source.report is not None and source.report.is_file()
-        else None,
+        "licence": report["licence"] if (report := _read_if_any(source.report)) is not None else None,
+        "refinement": _read_if_any(source.refinement),
         "views": [
             {"id": view, "generated": bool(generated), "posed": bool(posed)}
             for view, generated, posed in zip(
@@ -270,6 +283,11 @@ def _warnings(methods: Sequence[Mapping[str, Any]], parameters: Mapping[str, str
 
 def _statistics(folder: Path) -> dict[str, Any]:
     return {path.stem: read_json(path) for path in sorted(folder.glob("*.json"))} if folder.is_dir() else {}
+
+
+def _read_if_any(path: Path | None) -> Any:
+    """Content of a file that only some runs have; None without it."""
+    return read_json(path) if path is not None and path.is_file() else None
 
 
 def _copy(source: Path, folder: Path, place: str) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.store import read_json, write_bytes_atomic
 from sceneexpander.report.collect import FACTS, MAIN_METHOD
+from sceneexpander.report.course import fits, looks_table, verdict
 from sceneexpander.report.curve import loss_curve
 from sceneexpander.report.words import COLUMNS, LAYERS, Column, method_words
 
@@ -82,6 +83,9 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
         ],
         "curve": loss_curve(series["loss"]) if series.get("loss") else "",
         "steps": len(series.get("loss", ())),
+        "looks": looks_table(facts["looks"]),
+        "verdict": verdict(facts["acceptance"]),
+        "fits": fits(facts["methods"]),
         "view_rows": _view_rows(facts, scene, methods),
     }
 
@@ -97,7 +101,7 @@ def _table_row(method: Mapping[str, Any], rows: Mapping[str, MetricsRow], column
         best = (max if column.better == "higher" else min)(rivals.values(), default=None)
         wins = len(set(rivals.values())) > 1 and rivals.get(method["name"]) == best
         spread = rows[method["name"]].spread.get(column.name)
-        text = _number(value, column) + ("" if spread is None else f" \u00b1 {_number(spread, column)}")
+        text = column.text(value) + ("" if spread is None else f" \u00b1 {column.text(spread)}")
         cells.append({"text": text, "best": wins})
     return {"name": method["name"], "label": words.label, "meaning": words.meaning, "cells": cells}
 
@@ -105,12 +109,6 @@ def _table_row(method: Mapping[str, Any], rows: Mapping[str, MetricsRow], column
 def _known(rows: Mapping[str, MetricsRow], column: Column) -> dict[str, float]:
     values = {name: row.value(column.name) for name, row in rows.items() if name != "captured"}
     return {name: value for name, value in values.items() if value is not None}
-
-
-def _number(value: float | None, column: Column) -> str:
-    if value is None:
-        return "\u2013"
-    return f"{100 * value:.{column.digits}f} %" if column.percent else f"{value:.{column.digits}f}"
 
 
 def _view_rows(

@@ -20,6 +20,12 @@ class Column:
     better: Better = ""
     percent: bool = False
 
+    def text(self, value: float | None) -> str:
+        """A value as it is printed; a dash if there is none."""
+        if value is None:
+            return "\u2013"
+        return f"{100 * value:.{self.digits}f} %" if self.percent else f"{value:.{self.digits}f}"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MethodWords:
@@ -161,6 +167,45 @@ COLUMNS = (
         percent=True,
         better="lower",
         meaning="Against the known depth of what no captured view saw.",
+    ),
+)
+
+
+# What a look at a running adaptation measures: names as in its entries, ``drift`` being the norm over all modules.
+LOOK_COLUMNS = (
+    Column(
+        name="captured_psnr",
+        label="Captured PSNR, dB",
+        better="higher",
+        meaning="Preservation: a few captured views rendered at the model's own cameras, against the photos.",
+    ),
+    Column(
+        name="inserted_psnr",
+        label="Inserted PSNR, dB",
+        better="higher",
+        meaning="Expansion: the picture above it against the inserted one.",
+    ),
+    Column(
+        name="captured_depth_change",
+        label="Captured depth moved",
+        digits=1,
+        percent=True,
+        better="lower",
+        meaning="Depth of the captured views against what the model believed before the insertion: mean absolute log ratio.",
+    ),
+    Column(
+        name="head_disagreement",
+        label="Heads disagree",
+        digits=1,
+        percent=True,
+        better="lower",
+        meaning="Depth that the model tells against the depth at which it puts its Gaussians: mean absolute log ratio.",
+    ),
+    Column(
+        name="drift",
+        label="Weights moved",
+        digits=3,
+        meaning="Norm of the change of all weights since the round began.",
     ),
 )
 

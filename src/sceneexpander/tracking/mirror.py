@@ -99,8 +99,8 @@ def _looks(item: Mapping[str, Any]) -> dict[str, list[tuple[int, float]]]:
 
 
 def _look_pictures(item: Mapping[str, Any], folder: Path) -> dict[str, Path]:
-    pictures = item["looks"]["pictures"] if item["looks"] else ()
-    return {f"looks/{Path(path).name}": folder / path for path in pictures}
+    looks = item["looks"]["entries"] if item["looks"] else ()
+    return {f"looks/{Path(path).name}": folder / path for look in looks for path in look["pictures"].values()}
 
 
 def _unavailable(

@@ -9,15 +9,20 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
+from sceneexpander.adaptation.acceptance import Acceptance
+from sceneexpander.adaptation.observe import Look
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.metrics import MetricsRow, UnavailableRow
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
+from sceneexpander.optimisation.refine import RefineReport
 from sceneexpander.rendering import RenderConfig, produce_renders
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene, write_page
+from sceneexpander.report.course import fits
 from sceneexpander.report.curve import loss_curve
 from sceneexpander.report.words import COLUMNS
 from sceneexpander.tracking import scene_runs
@@ -27,6 +32,10 @@ from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
 NASTY = '<script>alert("1")</script> & "quotes"'
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 METHODS = ("captured", "backbone", "sceneexpander")
+HARM = "the adaptation harms the captured views: they rendered at 22.25 dB before it and at 21.50 dB after step 40"
+FITTING = Acceptance(
+    posed=True, overlap=0.451, depth_conflict=0.006, colour_conflict=0.013, cameras_moved_deg=0.034, reasons=()
+)
 LACKING = Unavailable(method="ttt3r", model="ttt3r", reason="needs the public checkpoint")
 
 
@@ -43,6 +52,26 @@ def view(view_id: str, *, generated: bool = False) -> ViewSet:
     )
     picture = torch.rand(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(len(view_id)))
     return ViewSet(records=(record,), images=picture, detail_images=picture)
+
+
+def look(step: int, captured_psnr: float) -> Look:
+    moved = {"network.trunk": 0.03 * step, "network.stem": 0.04 * step} if step else {}
+    return Look(
+        step=step,
+        captured_psnr=captured_psnr,
+        inserted_psnr=18.0 + step / 100,
+        captured_depth_change=0.034,
+        head_disagreement=0.014,
+        drift=moved,
+    )
+
+
+def save_looks(folder: Path, looks: list[Look], warnings: list[str]) -> None:
+    for item in looks:
+        for kind in ("captured", "inserted", "depth"):
+            (folder / "looks").mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", (8, 6)).save(folder / "looks" / f"{kind}_{item.step:04d}.jpg")
+    write_json_atomic(folder / "looks.json", {"identity": "abc", "looks": looks, "warnings": warnings})
 
 
 def row(method: str, psnr: float) -> MetricsRow:
@@ -105,6 +134,9 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
         {"started": 1.7e9, "wall_s": 2.0, "cpu_s": 2.0, "peak_rss_mb": 99.0, "host": host},
     )
     write_json_atomic(folder / "log.json", [{"loss": 2.0 / step, "drift": 0.0} for step in (1, 2, 3)])
+    save_looks(folder, [look(0, 22.25), look(40, 21.5)], [HARM])
+    write_json_atomic(folder / "acceptance.json", FITTING)
+    write_json_atomic(folder / "captured" / "refinement.json", RefineReport(steps=80, before=0.082, after=0.0312))
     return SceneSource(
         scene=folder / "scene",
         report=folder / "report.json",
@@ -121,6 +153,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
                         splats=folder / "packed" / name,
                         metrics=folder / "metrics" / f"{name}.json",
                         report=folder / name / "report.json",
+                        refinement=folder / name / "refinement.json",
                     )
                     for name in (*METHODS, "ttt3r")
                 ],
@@ -219,6 +252,87 @@ def test_bold_compares_methods_with_the_inserted_view(page: Path) -> None:
     assert "20.00" not in bold, "captured only is a ceiling, not a competitor"
 
 
+def looks_of(page: Path) -> str:
+    (table,) = re.findall(r'<table class="looks">.*?</table>', page.read_text(), re.DOTALL)
+    return table
+
+
+def test_looks_show_the_inserted_view_step_by_step_with_their_numbers(page: Path) -> None:
+    table = looks_of(page)
+    headings = re.findall(r"<th>([^<]*)</th>", table.split("</thead>")[0])
+    assert headings == ["", "inserted picture", "before the first step", "after step 40"]
+    rows = dict(re.findall(r'<th scope="row"[^>]*>([^<]*)</th>(.*?)</tr>', table, re.DOTALL))
+    places = {kind: [f"{kind}_0000.jpg", f"{kind}_0040.jpg"] for kind in ("inserted", "depth")}
+    assert re.findall(r'looks/([^"]+)"', rows["render"]) == places["inserted"]
+    assert re.findall(r'looks/([^"]+)"', rows["depth"]) == places["depth"]
+    numbers = {name: re.sub("<[^>]+>", " ", cells).split() for name, cells in rows.items()}
+    assert numbers["Captured PSNR, dB"] == ["22.25", "21.50", "-0.75"], "what was lost stands beside it"
+    assert numbers["Inserted PSNR, dB"] == ["18.00", "18.40", "+0.40"]
+    assert numbers["Captured depth moved"] == ["3.4", "%", "3.4", "%"]
+    assert numbers["Weights moved"] == ["0.000", "2.000"], "the norm over both modules"
+
+
+def test_harm_is_said_where_it_shows_and_with_the_rounds_warnings(page: Path) -> None:
+    above, below = page.read_text().split("<h3>Before and after</h3>")
+    sentence = f'<p class="warning">T{HARM[1:]}.</p>'
+    assert sentence in above
+    assert sentence in below
+
+
+def test_the_verdict_on_the_inserted_view_is_a_sentence(page: Path) -> None:
+    (sentence,) = re.findall(r"Before the adaptation, the inserted view[^<]*", page.read_text())
+    for part in (
+        "found to fit",
+        "see 45 % of it",
+        "depth differs from theirs by 0.6 %",
+        "colours by 1.3 %",
+        "0.03 degrees",
+    ):
+        assert part in sentence
+
+
+def written(source: SceneSource, item: RoundSource, folder: Path) -> str:
+    (folder / "room").mkdir()
+    (folder / "report").mkdir()
+    collect_scene(replace(source, rounds=[item]), folder / "room")
+    write_page([folder / "room"], folder / "report")
+    return (folder / "report" / "index.html").read_text()
+
+
+def test_a_view_that_does_not_fit_is_a_warning(source: SceneSource, tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    write_json_atomic(state / "log.json", [])
+    refused = replace(FITTING, posed=False, depth_conflict=None, colour_conflict=None, reasons=("no camera was found",))
+    write_json_atomic(state / "acceptance.json", refused)
+    html = written(source, replace(source.rounds[0], log=state / "log.json"), tmp_path)
+    above, below = html.split("<h3>Before and after</h3>")
+    for part in (above, below):
+        assert re.search(r'<p class="warning">The inserted view fits badly[^<]*: no camera was found\.', part)
+    assert "found to fit" not in html
+
+
+@pytest.mark.parametrize("saved", ["nothing", "no looks"])
+def test_without_looks_the_page_is_silent_about_them(source: SceneSource, tmp_path: Path, saved: str) -> None:
+    state = tmp_path / "state"
+    write_json_atomic(state / "log.json", [{"loss": 1.0}])
+    if saved == "no looks":
+        save_looks(state, [], [])
+    methods = [replace(method, refinement=None) for method in source.rounds[0].methods]
+    html = written(source, replace(source.rounds[0], log=state / "log.json", methods=methods), tmp_path)
+    assert 'class="looks"' not in html
+    assert "inserted view was found" not in html
+    assert "Gaussians of" not in html
+    assert "<h3>Adaptation" in html
+    assert not (tmp_path / "room" / "round_1" / "looks").exists()
+
+
+def test_a_fit_of_the_gaussians_says_what_it_changed(page: Path) -> None:
+    lines = re.findall(r"Gaussians of [^<]*", page.read_text())
+    assert lines == ["Gaussians of Captured only: photometric loss 0.0820 to 0.0312 in 80 steps"], "the others had none"
+    useless = {"name": "captured", "model": "mini", "refinement": {"steps": 4, "before": 0.08, "after": 0.09}}
+    assert "kept as they were" in fits([useless])[0]
+
+
 def test_gathering_repeats_bit_for_bit(source: SceneSource, gathered: Path, tmp_path: Path) -> None:
     collect_scene(source, tmp_path)
     for path in sorted(gathered.rglob("*")):
@@ -242,6 +356,8 @@ def test_runs_to_track_come_from_the_same_folder(gathered: Path, tmp_path: Path)
     assert set(runs) == set(METHODS)
     assert len({run.key for run in (*runs.values(), lacking)}) == 4
     adapted = runs["sceneexpander"]
+    assert adapted.sparse["look/captured_psnr"] == [(0, 22.25), (40, 21.5)]
+    assert len([place for place in adapted.artefacts if place.startswith("looks/")]) == 6
     assert adapted.series["loss/loss"] == (2.0, 1.0, 2.0 / 3)
     assert not runs["backbone"].series
     assert adapted.metrics["psnr_db"] == 22.0

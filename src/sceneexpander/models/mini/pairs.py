@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional
 
+from sceneexpander.geometry.lookup import project_to_views, sample_at
 from sceneexpander.geometry.normals import viewing_rays
 from sceneexpander.geometry.rigid import rigid_inverse, transform_points
 
@@ -85,7 +85,7 @@ class PairGeometry:
     def _measure(self, view: int, others: Sequence[int]) -> Pairs:
         chosen = torch.tensor(others, device=self.points_world.device)
         height, width = self.content.shape[-2:]
-        grid, log_z, in_frame = project_to_views(
+        grid, z, in_frame = project_to_views(
             self.points_world[view], self.cam_from_world[chosen], self.intrinsics_px[chosen], height, width
         )
         seen = sample_at(self.content[chosen], grid)
@@ -102,7 +102,7 @@ class PairGeometry:
         return Pairs(
             grid=grid,
             in_frame=in_frame,
-            behind=(log_z - seen[:, 0]).clamp(-1, 1),
+            behind=(z.log() - seen[:, 0]).clamp(-1, 1),
             weight=seen[:, 1] * in_frame,
             nearest=torch.stack(nearest),
         )
@@ -144,33 +144,6 @@ class PairGeometry:
         return torch.unflatten(out, -1, (height, width))
 
 
-def project_to_views(
-    points_world: Float[Tensor, "point 3"],
-    cam_from_world: Float[Tensor, "other 4 4"],
-    intrinsics_px: Float[Tensor, "other 3 3"],
-    height: int,
-    width: int,
-) -> tuple[Float[Tensor, "other point 2"], Float[Tensor, "other point"], Bool[Tensor, "other point"]]:
-    """(place for `sample_at`, log of the depth there, whether it is in frame) of points in other views."""
-    points = transform_points(cam_from_world, points_world.expand(len(cam_from_world), -1, -1))
-    depth = points[..., 2]
-    pixel = (points @ intrinsics_px.transpose(-1, -2))[..., :2] / depth.clamp(min=1e-6)[..., None]
-    grid = pixel / pixel.new_tensor([width / 2, height / 2]) - 1
-    in_frame = (depth > 1e-6) & (grid.abs() < 1).all(-1)
-    # Far outside coordinates would overflow the sampler's integers.
-    return grid.clamp(-2, 2), depth.clamp(min=1e-6).log(), in_frame
-
-
-def sample_at(
-    content: Float[Tensor, "other channel height width"], grid: Float[Tensor, "other point 2"]
-) -> Float[Tensor, "other channel point"]:
-    """Bilinear samples; outside the frame the border is repeated."""
-    sampled = functional.grid_sample(
-        content, grid[:, :, None], mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return sampled[..., 0]
-
-
 def sample_other_views(
     points_world: Float[Tensor, "point 3"],
     content: Float[Tensor, "other channel height width"],
@@ -179,8 +152,8 @@ def sample_other_views(
 ) -> tuple[Float[Tensor, "other channel point"], Float[Tensor, "other point"], Bool[Tensor, "other point"]]:
     """(content of other views where the points project, log of the points' depth there, whether they are in frame)."""
     height, width = content.shape[-2:]
-    grid, log_z, in_frame = project_to_views(points_world, cam_from_world, intrinsics_px, height, width)
-    return sample_at(content, grid), log_z, in_frame
+    grid, z, in_frame = project_to_views(points_world, cam_from_world, intrinsics_px, height, width)
+    return sample_at(content, grid), z.log(), in_frame
 
 
 def splat_log_depth(
