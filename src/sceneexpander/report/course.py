@@ -9,6 +9,8 @@ from typing import Any
 
 from sceneexpander.report.words import LOOK_COLUMNS, Column, method_words
 
+FITTED = "Its Gaussians were fitted to its pictures: PSNR, SSIM and ST-LPIPS are those of pictures it was fitted to."
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LookCell:
@@ -95,6 +97,12 @@ def verdict(acceptance: Mapping[str, Any] | None) -> Verdict | None:
     return Verdict(
         text=f"Before the adaptation, the inserted view was found to fit: {', '.join(parts)}.", refused=False
     )
+
+
+def was_fitted(method: Mapping[str, Any]) -> bool:
+    """Whether a fit of the method's Gaussians to their pictures was kept."""
+    refinement = method["refinement"]
+    return refinement is not None and refinement["after"] < refinement["before"]
 
 
 def fits(methods: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.store import read_json, write_bytes_atomic
 from sceneexpander.report.collect import FACTS, MAIN_METHOD
-from sceneexpander.report.course import fits, looks_table, verdict
+from sceneexpander.report.course import FITTED, fits, looks_table, verdict, was_fitted
 from sceneexpander.report.curve import loss_curve
 from sceneexpander.report.words import COLUMNS, LAYERS, Column, method_words
 
@@ -103,7 +103,8 @@ def _table_row(method: Mapping[str, Any], rows: Mapping[str, MetricsRow], column
         spread = rows[method["name"]].spread.get(column.name)
         text = column.text(value) + ("" if spread is None else f" \u00b1 {column.text(spread)}")
         cells.append({"text": text, "best": wins})
-    return {"name": method["name"], "label": words.label, "meaning": words.meaning, "cells": cells}
+    fitted = f" {FITTED}" if was_fitted(method) else ""
+    return {"name": method["name"], "label": words.label, "meaning": words.meaning + fitted, "cells": cells}
 
 
 def _known(rows: Mapping[str, MetricsRow], column: Column) -> dict[str, float]:

@@ -329,6 +329,7 @@ def test_without_looks_the_page_is_silent_about_them(source: SceneSource, tmp_pa
 def test_a_fit_of_the_gaussians_says_what_it_changed(page: Path) -> None:
     lines = re.findall(r"Gaussians of [^<]*", page.read_text())
     assert lines == ["Gaussians of Captured only: photometric loss 0.0820 to 0.0312 in 80 steps"], "the others had none"
+    assert page.read_text().count("those of pictures it was fitted to") == 1
     useless = {"name": "captured", "model": "mini", "refinement": {"steps": 4, "before": 0.08, "after": 0.09}}
     assert "kept as they were" in fits([useless])[0]
 
