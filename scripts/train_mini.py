@@ -22,6 +22,11 @@ from sceneexpander.models.mini.training.buffer import fill_buffer, sample_path, 
 from sceneexpander.models.mini.training.generate import GeneratorConfig, training_sample
 from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.mini.training.trainer import LossWeights, TrainConfig, Trainer
+from sceneexpander.models.weights import resolve_weights
+from sceneexpander.project import find_project
+from sceneexpander.tracking.config import TrackingConfig
+from sceneexpander.tracking.curve import CurveRun
+from sceneexpander.tracking.record import flatten, run_key
 
 MIN_SAMPLES = 40  # in the buffer before training starts
 
@@ -66,17 +71,39 @@ def train(config: DictConfig) -> None:
     validation = make_validation(Path(config.validation), config.validation_scenes, config.validation_seed)
     trainer = Trainer(settings(config), MiniConfig(), folder, samples)
     resumed = trainer.resume()
+    if not resumed and config.initial_weights is not None:
+        trainer.start_from(resolve_weights(config.initial_weights, model=Mini.name).path)
     logging.info(
         "%s at step %d, %d parameters", "resumed" if resumed else "started", trainer.step, parameters(trainer.model)
     )
     filler = start_filler(config) if config.fill_in_background else None
     try:
         wait_for_samples(samples)
-        trainer.run(validation)
+        curve = learning_curve(config)
+        trainer.run(validation, lambda line: curve.add(line["step"], curve_points(line)))
+        curve.finish()
     finally:
         if filler is not None and filler.stdin is not None:
             filler.stdin.close()
             filler.wait()
+
+
+def learning_curve(config: DictConfig) -> CurveRun:
+    """The run of MLflow that holds this training's curves; a resumed training goes on with the run it began."""
+    values: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    return CurveRun(
+        run_key("train_mini", str(Path(config.folder).resolve())),
+        name=f"mini, training in {config.folder}",
+        params=flatten({key: values[key] for key in ("train", "weights", "data_seed", "initial_weights")}),
+        config=TrackingConfig(uri=config.tracking.uri, experiment=config.tracking.experiment),
+        root=find_project(),
+    )
+
+
+def curve_points(line: dict[str, Any]) -> dict[str, float]:
+    """The numbers of a line of the learning curve, by the names of their curves."""
+    plain = {key: float(line[key]) for key in ("scenes", "cpu_minutes", "learning_rate", "buffer")}
+    return plain | {f"loss/{k}": v for k, v in line["loss"].items()} | line["validation"]
 
 
 def parameters(model: torch.nn.Module) -> int:

@@ -40,6 +40,8 @@ from sceneexpander.frontend.twoview import (
     match_and_verify,
     match_guided,
     relative_pose,
+    rotation_focal,
+    scaled_focal,
 )
 
 __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "estimate_cameras"]
@@ -131,9 +133,9 @@ def _model(
         for a in range(views)
         for b in range(a + 1, views)
     ]
-    kinds = _pair_kinds(features, pairs, focal.nominal, config, setup)
-    mapping, source = _map(build_tracks(features, pairs), features, pairs, kinds, known, focal, config, setup)
-    return _Model(features=features, pairs=pairs, kinds=kinds, mapping=mapping, focal_source=source)
+    found = _pair_kinds(features, pairs, focal, config, setup)
+    mapping, source = _map(build_tracks(features, pairs), features, pairs, found, known, focal, config, setup)
+    return _Model(features=features, pairs=pairs, kinds=found.kinds, mapping=mapping, focal_source=source)
 
 
 def _with_learned_matches(
@@ -165,35 +167,64 @@ def _pairs_worth_matching(model: _Model, config: SfmConfig) -> list[tuple[int, i
     return sorted(worth)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _PairKinds:
+    """What the pairs are, and what a turning camera says about its focal length."""
+
+    kinds: list[PairKind]
+    turning_focal: float | None  # factor on the nominal focal that makes pure rotations of such pairs; None without any
+
+
 def _pair_kinds(
-    features: list[Features], pairs: list[PairMatches], intrinsics: np.ndarray, config: SfmConfig, setup: Setup
-) -> list[PairKind]:
-    """Which pairs have parallax. The focal hardly matters for that question."""
-    kinds = []
+    features: list[Features], pairs: list[PairMatches], focal: FocalPlan, config: SfmConfig, setup: Setup
+) -> _PairKinds:
+    """Which pairs have parallax.
+
+    A wrong focal bends a wide turn so much that it looks like parallax, so where the focal is unknown the one that turns the pair's
+    homography into a rotation is asked, too. It has to explain more of the matches: a free focal can hide a little parallax.
+    """
+    kinds, factors = [], []
     rng = np.random.default_rng(setup.seed)
+    low, high = config.focal_bounds
+    unit_factor = setup.long_side / focal.nominal[0, 0, 0]
+    bounds = (low * unit_factor, high * unit_factor)
+    threshold = config.rotation_px * setup.unit_px
+
+    def share(pair: PairMatches, factor: float) -> float:
+        """Of the pair's matches that one rotation explains, at a factor on the nominal focal."""
+        _, inlier = fit_rotation(
+            features[pair.view_a].pixel_xy[pair.verified.index_a],
+            features[pair.view_b].pixel_xy[pair.verified.index_b],
+            scaled_focal(focal.nominal[pair.view_a], factor),
+            scaled_focal(focal.nominal[pair.view_b], factor),
+            threshold_px=threshold,
+            rng=rng,
+        )
+        return float(inlier.mean())
+
     for pair in pairs:
         a, b, matches = pair.view_a, pair.view_b, pair.verified
         if matches.count == 0:
             kinds.append(PairKind.UNRELATED)
             continue
-        _, inlier = fit_rotation(
-            features[a].pixel_xy[matches.index_a],
-            features[b].pixel_xy[matches.index_b],
-            intrinsics[a],
-            intrinsics[b],
-            threshold_px=config.rotation_px * setup.unit_px,
-            rng=rng,
-        )
-        rotation_only = inlier.sum() >= config.rotation_share * matches.count
+        factor = 1.0
+        rotation_only = share(pair, factor) >= config.rotation_share
+        if not rotation_only and focal.source is None:
+            xy_a, xy_b = features[a].pixel_xy[matches.index_a], features[b].pixel_xy[matches.index_b]
+            found = rotation_focal(xy_a, xy_b, focal.nominal[a], bounds, threshold_px=threshold, seed=setup.seed)
+            if found is not None and share(pair, found) >= config.rotation_share_free_focal:
+                factor, rotation_only = found, True
         kinds.append(PairKind.ROTATION if rotation_only else PairKind.PARALLAX)
-    return kinds
+        if rotation_only:
+            factors.append(factor)
+    return _PairKinds(kinds=kinds, turning_focal=float(np.median(factors)) if factors else None)
 
 
 def _map(
     tracks: Tracks,
     features: list[Features],
     pairs: list[PairMatches],
-    kinds: list[PairKind],
+    found: _PairKinds,
     known: KnownCameras,
     focal: FocalPlan,
     config: SfmConfig,
@@ -214,7 +245,7 @@ def _map(
 
     initial: list[PairMatches | None] = [None]
     if not known.posed.any():
-        initial = _initial_pairs(features, pairs, kinds, focal.nominal, config, setup)
+        initial = _initial_pairs(features, pairs, found.kinds, focal.nominal, config, setup)
     best: Mapping | None = None
     for position, pair in enumerate(initial):
         # The first pair finds the focal; further pairs only have to beat it there.
@@ -223,9 +254,11 @@ def _map(
             if candidate is not None and (best is None or candidate.score() > best.score()):
                 best = candidate
     if best is None or not best.valid.any():
-        empty = _new_mapping(tracks, focal.nominal, focal, config, setup)
+        turning = 1.0 if found.turning_focal is None else found.turning_focal
+        start = np.stack([scaled_focal(intrinsics, turning) for intrinsics in focal.nominal])
+        empty = _new_mapping(tracks, start, focal, config, setup)
         _set_known_poses(empty, known)
-        return empty, focal.source or FocalSource.ASSUMED
+        return empty, focal.source or (FocalSource.ASSUMED if turning == 1 else FocalSource.TURNED)
     best = _on_all_tracks(best, tracks, focal, config, setup)
     free = _free_views(best, known, config)
     best.grow(refine_focal=False, free=free)

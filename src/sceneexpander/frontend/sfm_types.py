@@ -52,6 +52,7 @@ class SfmConfig:
     min_pair_inliers: int = 15
     min_pair_inlier_share: float = 0.12
     rotation_share: float = 0.8  # rotation-only: a pure rotation explains this share of the verified matches
+    rotation_share_free_focal: float = 0.9  # the same at the focal that suits the pair best
     rotation_px: float = 2.5
 
     # Focal length, in units of the long side.
@@ -111,6 +112,7 @@ class FocalSource(StrEnum):
     REFINED = "refined"  # bundle adjustment
     HINT = "hint"  # given focal, kept
     SWEPT = "swept"  # the best of the starts, kept because there are too few views to refine it
+    TURNED = "turned"  # the one that makes a camera without parallax turn as a rigid body does
     ASSUMED = "assumed"  # nothing, or too little, to estimate it from: the prior
 
 

@@ -262,6 +262,24 @@ def test_pure_rotation_is_flagged_and_its_rotation_found() -> None:
     assert found.world_from_cam[:, :3, 3].abs().max() < 1e-6
 
 
+def test_a_turning_camera_of_unknown_focal_is_known_by_its_turn() -> None:
+    """At the assumed focal of 0.85 these turns look like parallax, and would get depth from nothing."""
+    focal = 1.1 * WIDTH
+    angles = torch.tensor([0.0, 0.13, 0.26])
+    poses = torch.eye(4).repeat(3, 1, 1)
+    poses[:, 0, 0], poses[:, 2, 2] = angles.cos(), angles.cos()
+    poses[:, 0, 2], poses[:, 2, 0] = angles.sin(), -angles.sin()
+    board = scenes.Rectangle(corner=(-0.3, -0.2, 1.5), edge_u=(0.5, 0, 0), edge_v=(0, 0.6, 0), seed=5)
+    turning = scenes.render([scenes.wall(2.4, 3), board], poses, focal, HEIGHT, WIDTH)
+    found = estimate_cameras(turning.images, FAST, generator=generator())
+    assert found.report.points == 0
+    assert all("rotation" in view.reason for view in found.report.views[1:])
+    assert found.report.focal_source is FocalSource.TURNED
+    assert any("no depth" in note for note in found.report.notes)
+    assert found.report.focal_ratio == pytest.approx(1.1, rel=0.05)
+    assert rotation_angle_deg(found.world_from_cam[:, :3, :3], poses[:, :3, :3]).max() < 1.0
+
+
 @pytest.mark.parametrize("views", [1, 2, 3])
 def test_plain_images_give_a_flagged_identity(views: int) -> None:
     found = estimate_cameras(torch.full((views, 3, 60, 80), 0.5), FAST, generator=generator())

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sfm_worlds as worlds
 
+from sceneexpander.frontend.bundle import rotation_exp
 from sceneexpander.frontend.features import Features, detect_features, grey_u8
 from sceneexpander.frontend.matching import Matches, guided_matches, mutual_matches, similarity
 from sceneexpander.frontend.sfm_types import SfmConfig
@@ -15,7 +16,10 @@ from sceneexpander.frontend.twoview import (
     distinct_positions,
     fit_fundamental,
     fit_rotation,
+    homogeneous_rays,
     relative_pose,
+    rotation_focal,
+    scaled_focal,
     triangulate_pair,
 )
 
@@ -133,6 +137,30 @@ def test_rotation_fit_knows_rotation_from_parallax() -> None:
         world.pixel_xy[:, 0], world.pixel_xy[:, 1], *world.intrinsics, threshold_px=1.0, rng=np.random.default_rng(0)
     )
     assert parallax.mean() < 0.3
+
+
+def test_a_turn_gives_the_focal_and_a_plane_seen_from_two_places_does_not_pass_for_one() -> None:
+    rng = np.random.default_rng(3)
+    camera = np.array([[420.0, 0, 160], [0, 420, 120], [0, 0, 1]])
+    guess = scaled_focal(camera, 0.7)
+    xy = rng.uniform([0, 0], [320, 240], (200, 2))
+    rotation = rotation_exp(np.array([0.05, 0.2, 0.02]))
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        projected = points @ camera.T
+        return projected[:, :2] / projected[:, 2:] + rng.normal(0, 0.1, (len(points), 2))
+
+    rays = homogeneous_rays(xy, camera)
+    factor = rotation_focal(xy, seen(rays @ rotation.T), guess, (0.4, 2.5), threshold_px=1.0, seed=0)
+    assert factor == pytest.approx(1 / 0.7, rel=0.03)
+    # A slanted wall and a step aside: also a homography, but no focal makes it a rotation of all matches.
+    wall = rays / (1.3 + 0.5 * rays[:, :1] + 0.2 * rays[:, 1:2])
+    moved = seen(wall @ rotation.T + np.array([0.25, 0.02, 0.05]))
+    factor = rotation_focal(xy, moved, guess, (0.4, 2.5), threshold_px=1.0, seed=0)
+    assert factor is not None
+    there = scaled_focal(guess, factor)
+    _, inlier = fit_rotation(xy, moved, there, there, threshold_px=1.0, rng=rng)
+    assert inlier.mean() < 0.6
 
 
 def test_triangulation_is_exact_and_parallel_rays_are_finite() -> None:

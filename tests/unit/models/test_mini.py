@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from sceneexpander.errors import UserError
+from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.geometry.camera import project_points
 from sceneexpander.geometry.gauge import priors_relative_to
 from sceneexpander.geometry.normals import normals_from_depth
@@ -18,11 +19,19 @@ from sceneexpander.models.mini import Mini, MiniConfig
 from sceneexpander.models.mini.inputs import working_size
 from sceneexpander.models.mini.pairs import PairGeometry, splat_log_depth
 from sceneexpander.models.mini.splats import covered_by_others
-from sceneexpander.models.mini.training.augment import mirrored
-from sceneexpander.models.mini.training.generate import Conditions, sample_of_scene
+from sceneexpander.models.mini.training.augment import augment, mirrored
+from sceneexpander.models.mini.training.generate import (
+    Conditions,
+    GeneratorConfig,
+    in_scale_of_base,
+    own_cameras_sample,
+    sample_of_scene,
+    training_sample,
+)
 from sceneexpander.models.mini.training.losses import confidence_loss, render_loss
 from sceneexpander.models.mini.training.measure import geometry_row
 from sceneexpander.models.mini.training.sample import Sample
+from sceneexpander.models.mini.training.scores import scene_samples
 from sceneexpander.models.mini.training.trainer import LossWeights, TrainConfig, Trainer
 from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor
 from sceneexpander.synthetic.views import make_views
@@ -404,6 +413,66 @@ def test_another_first_view_changes_only_the_frame(held_out: list[Sample]) -> No
     relative = rigid_inverse(sample.world_from_cam[1]) @ sample.world_from_cam[0]
     torch.testing.assert_close(moved.world_from_cam[1], relative, atol=1e-5, rtol=0)
     assert torch.equal(moved.images[1], sample.images[0])
+
+
+def test_truth_takes_the_scale_of_the_base(held_out: list[Sample]) -> None:
+    sample = held_out[0]
+    farther = replace(sample, prior_log_depth=sample.prior_log_depth + 0.7)
+    scaled = in_scale_of_base(farther)
+    again = in_scale_of_base(sample)
+    torch.testing.assert_close(
+        scaled.log_depth[sample.valid] - again.log_depth[sample.valid],
+        torch.tensor(0.7).expand(int(sample.valid.sum())),
+    )
+    error = (scaled.prior_log_depth - scaled.log_depth[: sample.inputs])[
+        sample.valid[: sample.inputs] & sample.priors_confident()
+    ]
+    assert float(error.median()) == pytest.approx(0.0, abs=1e-6)
+    # Cameras move with the depth: a pixel of one view still falls on the same pixel of another.
+    ratio = scaled.world_from_cam[1:, :3, 3] / again.world_from_cam[1:, :3, 3]
+    torch.testing.assert_close(ratio, torch.full_like(ratio, 0.7).exp(), rtol=1e-4, atol=0)
+    torch.testing.assert_close(scaled.visible_from(0, [1]), sample.visible_from(0, [1]))
+
+
+def test_own_cameras_are_those_of_the_front_end_and_truth_stays_true(held_out: list[Sample]) -> None:
+    sample = held_out[0]
+    own = own_cameras_sample(sample, torch.Generator().manual_seed(0), DenseConfig(threads=1))
+    assert own.wrong_focal
+    assert torch.equal(own.images, sample.images)
+    assert not torch.equal(own.prior_intrinsics_px, sample.prior_intrinsics_px)
+    shift = own.log_depth - sample.log_depth
+    assert float(shift[sample.valid].std()) < 1e-5, "one factor for the whole scene"
+    assert torch.equal(own.prior_world_from_cam[0], torch.eye(4))
+
+
+def test_a_share_of_the_training_scenes_runs_the_whole_front_end() -> None:
+    config = GeneratorConfig(sizes=((112, 168),), view_shares=(0.0, 0.0, 1.0), own_cameras_share=1.0)
+    own = training_sample(3, 11, config)
+    simulated = training_sample(3, 11, replace(config, own_cameras_share=0.0))
+    assert torch.equal(own.images, simulated.images)
+    assert own.wrong_focal
+    assert not torch.equal(own.prior_world_from_cam, simulated.prior_world_from_cam)
+
+
+def test_the_first_view_of_an_augmented_sample_has_a_pose(held_out: list[Sample]) -> None:
+    sample = replace(held_out[0], posed=torch.tensor([False, False, True]))
+    for seed in range(8):
+        assert bool(augment(sample, torch.Generator().manual_seed(seed)).posed[0])
+
+
+def test_kept_samples_of_a_scored_scene_are_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sceneexpander.models.mini.training.scores.HEIGHT", 112)
+    monkeypatch.setattr("sceneexpander.models.mini.training.scores.WIDTH", 168)
+    first = scene_samples(5, noisy=True, front_end=False, kept=tmp_path)
+    assert first.own_cameras is None
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["5_noisy.safetensors", "5_true.safetensors"]
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("made again")
+
+    monkeypatch.setattr("sceneexpander.models.mini.training.scores.sample_of_scene", refuse)
+    again = scene_samples(5, noisy=True, front_end=False, kept=tmp_path)
+    assert torch.equal(again.true_cameras.prior_log_depth, first.true_cameras.prior_log_depth)
 
 
 def test_confidence_loss_is_least_where_confidence_is_one_over_the_error() -> None:

@@ -14,8 +14,9 @@ def augment(sample: Sample, generator: torch.Generator) -> Sample:
     """Mirror (half of the time), random order, sometimes one view fewer, colours of all views changed together or apart."""
     chance = torch.rand(3, generator=generator).tolist()
     order = torch.randperm(sample.inputs, generator=generator).tolist()
-    if not bool(sample.posed[order[0]]):  # the first view defines the world, so it must have a pose
-        order.append(order.pop(0))
+    # The first view defines the world, so it must have a pose.
+    first = next((view for view in order if bool(sample.posed[view])), order[0])
+    order = [first, *(view for view in order if view != first)]
     if sample.inputs > 2 and chance[0] < 0.2:
         order = order[:-1]
     sample = sample.select_inputs(order)

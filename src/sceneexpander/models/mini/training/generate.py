@@ -1,14 +1,15 @@
-"""Makes samples: a procedural scene, simulated front-end errors, and the real dense base run on them."""
+"""Makes samples: a procedural scene, simulated or real front-end errors, and the real dense base run on them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, dense_depth
+from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.simulated import perturb_poses, sample_sparse_points
 from sceneexpander.frontend.sparse_points import SparsePoints
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
@@ -17,14 +18,18 @@ from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.synthetic.textures import Split
 from sceneexpander.synthetic.views import SyntheticViews, make_views
 
+MIN_CONFIDENT = 200  # pixels, for the scale of a scene to be read from the confident ones alone
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeneratorConfig:
     """What samples are drawn from. Shares and ranges; every draw comes from the sample's own seed."""
 
-    sizes: tuple[tuple[int, int], ...] = ((168, 224), (224, 168), (168, 168), (112, 168))  # height, width
+    # Height, width. The working sizes of the front-end, for the base of a smaller picture is another base.
+    sizes: tuple[tuple[int, int], ...] = ((280, 336), (280, 336), (336, 280), (252, 336), (224, 336), (168, 224))
     view_shares: tuple[float, ...] = (0.03, 0.2, 0.27, 0.33, 0.1, 0.07)  # of 1, 2, ... input views
     held_out_views: int = 1
+    own_cameras_share: float = 0.4  # of the samples of several views: the whole front-end, focal unknown
     exact_pose_share: float = 0.35
     strong_noise_share: float = 0.12
     wrong_focal_share: float = 0.1
@@ -70,7 +75,10 @@ def training_sample(index: int, seed: int, config: GeneratorConfig, *, split: Sp
         except ValueError:
             # Some worlds have no camera set of that size; the next draw is part of the same deterministic stream.
             continue
-        return sample_of_scene(scene, inputs, conditions, generator)
+        sample = sample_of_scene(scene, inputs, conditions, generator)
+        if inputs > 1 and float(torch.rand((), generator=generator)) < config.own_cameras_share:
+            return own_cameras_sample(sample, generator, DenseConfig(threads=1))
+        return sample
     raise ValueError(f"sample {index} of stream {seed}: no scene in 20 attempts")
 
 
@@ -161,6 +169,50 @@ def sample_of_scene(
         kind=scene.kind,
         seed=scene.seed,
     )
+
+
+def own_cameras_sample(sample: Sample, generator: torch.Generator, dense: DenseConfig) -> Sample:
+    """The sample with the cameras (focal unknown) and the base of the whole geometric front-end; truth in their scale."""
+    priors, _ = build_priors(sample.input_images, FrontendConfig(dense=dense), generator=generator)
+    poses, intrinsics, depth, evidence, posed = (
+        priors.world_from_cam,
+        priors.intrinsics_px,
+        priors.depth,
+        priors.evidence,
+        priors.posed,
+    )
+    if poses is None or intrinsics is None or depth is None or evidence is None or posed is None:
+        raise ValueError("the front-end returned incomplete priors")
+    return in_scale_of_base(
+        replace(
+            sample,
+            prior_world_from_cam=poses,
+            prior_intrinsics_px=intrinsics,
+            prior_log_depth=depth.log(),
+            sparse_log_depth=_add_gap(depth.log(), evidence[:, EVIDENCE_CHANNELS.index("sparse")]),
+            evidence=evidence,
+            posed=posed,
+            wrong_focal=True,
+        )
+    )
+
+
+def in_scale_of_base(sample: Sample) -> Sample:
+    """The sample with truth multiplied by the one factor that brings its depth to that of the base (median, confident pixels).
+
+    Views without a pose have no say, unless no view has one.
+    """
+    counted = sample.valid[: sample.inputs]
+    if bool(sample.posed.any()):
+        counted = counted & sample.posed[:, None, None]
+    confident = counted & sample.priors_confident()
+    counted = confident if int(confident.sum()) >= MIN_CONFIDENT else counted
+    if not bool(counted.any()):
+        return sample
+    shift = (sample.prior_log_depth - sample.log_depth[: sample.inputs])[counted].median()
+    world_from_cam = sample.world_from_cam.clone()
+    world_from_cam[:, :3, 3] *= shift.exp()
+    return replace(sample, log_depth=sample.log_depth + shift, world_from_cam=world_from_cam)
 
 
 def _add_gap(log_base: Float[Tensor, "view height width"], gap: Float[Tensor, "view height width"]) -> Tensor:

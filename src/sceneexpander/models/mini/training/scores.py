@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig
-from sceneexpander.frontend.prior import FrontendConfig, build_priors
-from sceneexpander.frontend.sfm_types import SfmConfig
-from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.models.mini.model import Mini
-from sceneexpander.models.mini.training.generate import Conditions, sample_of_scene
+from sceneexpander.models.mini.training.generate import Conditions, own_cameras_sample, sample_of_scene
 from sceneexpander.models.mini.training.measure import geometry_row, mean_row
 from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.protocol import ALL_HEADS, Head
@@ -77,54 +75,60 @@ def scene_with_views(seed: int) -> SyntheticViews:
     raise ValueError(f"no connected scene for seed {seed} in 50 attempts")
 
 
-def score_scene(model: Mini, seed: int, *, noisy: bool, front_end: bool) -> SceneScores:
-    """All numbers of one held-out scene. ``model`` is compared with the same model without residuals."""
-    scene = scene_with_views(seed)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneSamples:
+    """One held-out scene under each condition; None where that condition is not wanted."""
+
+    true_cameras: Sample
+    noisy_cameras: Sample | None
+    own_cameras: Sample | None
+
+
+def scene_samples(seed: int, *, noisy: bool, front_end: bool, kept: Path | None = None) -> SceneSamples:
+    """What the front-end makes of the held-out scene of a seed: nothing here depends on the network's weights.
+
+    Args:
+        seed: of the scene and of all simulated errors.
+        noisy, front_end: also with slightly wrong cameras; also with the front-end's own.
+        kept: folder in which samples lie that were made before, and where new ones are left.
+    """
+    if kept is not None:
+        kept.mkdir(parents=True, exist_ok=True)
     dense = DenseConfig(threads=torch.get_num_threads())
-    generator = torch.Generator().manual_seed(seed)
-    sample = sample_of_scene(scene, INPUTS, TRUE_CAMERAS, generator, dense=dense)
-    row = geometry_row(model, sample) | splat_row(model, sample)
-    noisy_row = None
-    if noisy:
-        noisy_row = geometry_row(model, sample_of_scene(scene, INPUTS, NOISY_CAMERAS, generator, dense=dense))
-    front_row: dict[str, float] | None = None
-    errors: tuple[float, ...] = ()
-    overlapping: tuple[float, ...] = ()
-    if front_end:
-        own = own_cameras_sample(sample, generator, dense)
-        front_row = geometry_row(model, own, unposed_count=True)
-        errors, overlapping = pose_errors_deg(own)
+
+    def sample(condition: str, make: Callable[[], Sample]) -> Sample:
+        if kept is None:
+            return make()
+        path = kept / f"{seed}_{condition}.safetensors"
+        if not path.exists():
+            make().save(path)
+        return Sample.load(path)
+
+    def simulated(conditions: Conditions, offset: int) -> Sample:
+        generator = torch.Generator().manual_seed(seed + offset)
+        return sample_of_scene(scene_with_views(seed), INPUTS, conditions, generator, dense=dense)
+
+    def own(true: Sample) -> Sample:
+        return own_cameras_sample(true, torch.Generator().manual_seed(seed), dense)
+
+    true = sample("true", lambda: simulated(TRUE_CAMERAS, 0))
+    return SceneSamples(
+        true_cameras=true,
+        noisy_cameras=sample("noisy", lambda: simulated(NOISY_CAMERAS, 1)) if noisy else None,
+        own_cameras=sample("own", lambda: own(true)) if front_end else None,
+    )
+
+
+def score_samples(model: Mini, samples: SceneSamples) -> SceneScores:
+    """All numbers of one held-out scene. ``model`` is compared with the same model without residuals."""
+    noisy, own = samples.noisy_cameras, samples.own_cameras
+    errors, overlapping = ((), ()) if own is None else pose_errors_deg(own)
     return SceneScores(
-        true_cameras=row,
-        noisy_cameras=noisy_row,
-        front_end=front_row,
+        true_cameras=geometry_row(model, samples.true_cameras) | splat_row(model, samples.true_cameras),
+        noisy_cameras=None if noisy is None else geometry_row(model, noisy),
+        front_end=None if own is None else geometry_row(model, own, unposed_count=True),
         pose_errors_deg=errors,
         pose_errors_overlapping_deg=overlapping,
-    )
-
-
-def own_cameras_sample(sample: Sample, generator: torch.Generator, dense: DenseConfig) -> Sample:
-    """The sample with the cameras (focal unknown) and the base of the whole geometric front-end."""
-    config = FrontendConfig(sfm=SfmConfig(), dense=dense)
-    priors, _ = build_priors(sample.input_images, config, generator=generator)
-    poses, intrinsics, depth, evidence, posed = (
-        priors.world_from_cam,
-        priors.intrinsics_px,
-        priors.depth,
-        priors.evidence,
-        priors.posed,
-    )
-    if poses is None or intrinsics is None or depth is None or evidence is None or posed is None:
-        raise ValueError("the front-end returned incomplete priors")
-    return replace(
-        sample,
-        prior_world_from_cam=poses,
-        prior_intrinsics_px=intrinsics,
-        prior_log_depth=depth.log(),
-        sparse_log_depth=depth.log() + evidence[:, EVIDENCE_CHANNELS.index("sparse")],
-        evidence=evidence,
-        posed=posed,
-        wrong_focal=True,
     )
 
 

@@ -7,9 +7,10 @@ import logging
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -157,6 +158,11 @@ class Trainer:
         self.seconds = 0.0  # of training, over all resumes
         self.cpu_seconds = 0.0
 
+    def start_from(self, weights: Path) -> None:
+        """Begin with the weights of a file instead of random ones. Raises what `Mini.from_weights` raises."""
+        self.model.load_state_dict(Mini.from_weights(weights).state_dict())
+        self.ema = {name: value.clone() for name, value in self.model.state_dict().items()}
+
     def _groups(self) -> list[dict[str, object]]:
         decayed = [p for p in self.model.parameters() if p.ndim > 1]
         plain = [p for p in self.model.parameters() if p.ndim <= 1]
@@ -212,8 +218,11 @@ class Trainer:
             samples = [augment(self.reader.draw(), self.generator) for _ in range(self.config.batch)]
             yield [sample.halved() for sample in samples] if self._half else samples
 
-    def run(self, validation: list[Sample]) -> None:
-        """Train to the end of the schedule, with a checkpoint and a validation every few minutes."""
+    def run(self, validation: list[Sample], report: Callable[[dict[str, Any]], None] = lambda line: None) -> None:
+        """Train to the end of the schedule, with a checkpoint and a validation every few minutes.
+
+        ``report`` gets every new line of the learning curve.
+        """
         full = self.model.config
         clock, clock_cpu = time.monotonic(), time.process_time()
         last_saved = clock
@@ -228,7 +237,7 @@ class Trainer:
             if done or time.monotonic() - last_saved > self.config.checkpoint_minutes * 60:
                 self.model.config = full
                 self.save()
-                self.log(recent, self.validate(validation))
+                report(self.log(recent, self.validate(validation)))
                 recent, last_saved = [], time.monotonic()
             if done:
                 return
@@ -244,8 +253,8 @@ class Trainer:
         model.load_state_dict(self.ema)
         return model
 
-    def log(self, recent: list[dict[str, float]], scores: dict[str, float]) -> None:
-        """Append one line to the learning curve."""
+    def log(self, recent: list[dict[str, float]], scores: dict[str, float]) -> dict[str, Any]:
+        """Append one line to the learning curve, and return it."""
         names = sorted({name for row in recent for name in row})
         means = {
             name: sum(row[name] for row in recent if name in row) / sum(name in row for row in recent) for name in names
@@ -265,6 +274,7 @@ class Trainer:
         keys = ("network/within", "base/within", "network/within_unconfident", "base/within_unconfident")
         shown = {key: round(scores[key], 3) for key in keys if key in scores}
         _LOG.info("step %d, %d scenes, %.1f min: %s", self.step, self.seen, self.seconds / 60, shown)
+        return line
 
     def save(self) -> None:
         """Write the whole state atomically."""
