@@ -1,4 +1,4 @@
-"""Rows of the ablation on scene folders without known truth: python scripts/real_ablation.py FOLDER ... --rows full,guarded
+"""Rows of the ablation on scene folders without known truth: python scripts/real_ablation.py FOLDER ... --rows full,none
 
 A folder is as in ``scenes/`` (photos in captured/, a scene.yaml whose first round names an inserted picture). Prints one line per row: what
 preservation and insertion can be measured without truth. The pre-insertion scene and the backbone are always there.
@@ -78,8 +78,11 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
     for row in rows:
         adapt: AdaptConfig = replace(composed(row, overrides).adapt, checkpoint_every=0)
         for seed in seeds:
-            _, reconstruction, _ = adapt_round(inputs, loaded, adapt, seed=seed)
-            reconstruction, _ = refined(reconstruction, views, config.refine, doubt_generated=adapt.trust, seed=seed)
+            state, reconstruction, _ = adapt_round(inputs, loaded, adapt, seed=seed)
+            # Fitted to the pictures that the round worked with, and measured on the ones that were given.
+            reconstruction, _ = refined(
+                reconstruction, state.views, config.refine, doubt_generated=adapt.trust, seed=seed
+            )
             print(line(f"{row} seed {seed}", reconstruction, views), flush=True)
         made[row] = reconstruction
     if out is not None:
@@ -93,7 +96,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="+", type=Path)
-    parser.add_argument("--rows", default="full,guarded")
+    parser.add_argument("--rows", default="full,none")
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--set", default=[], action="append", metavar="KEY=VALUE", help="configuration override")
     parser.add_argument("--out", type=Path, help="folder for pictures")

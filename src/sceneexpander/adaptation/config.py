@@ -165,6 +165,7 @@ class AdaptConfig:
     splat_others: float = 0.5  # weight of the same photos without the view's own Gaussians
     inserted_weights: InsertedWeights = InsertedWeights.UNIFORM
     realign: Realign = Realign.NONE
+    tone: bool = False  # bring the inserted picture to the photos' exposure and white balance, see `sceneexpander.adaptation.tone`
     trust: bool = False  # generated Gaussians fade where captured views contradict them, see `consistency.trusted`
     warp_targets: bool = False  # move the anchors of a warped view with its pixels
     precision: Precision = Precision.FP32

@@ -26,9 +26,8 @@ from sceneexpander.expandbench.measure import BenchNumbers, measure
 from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.scenes import BenchScene, build_scene
 from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model, refined
-from sceneexpander.expansion.rounds import adapted_weights, finished_round, realigned_priors, reconstruct
+from sceneexpander.expansion.rounds import RoundInputs, adapted_weights, aligned, finished_round, reconstruct
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.geometry.priors import Priors
 from sceneexpander.optimisation.refine import RefineConfig
 
 CAPTURED = "captured"  # the pre-insertion scene: the ceiling of preservation
@@ -141,7 +140,7 @@ class _Worker:
         self._loaded: LoadedModel | None = None
         self._prepared: PreparedScene | None = None
         self._cases: dict[str, PreparedCase] = {}
-        self._last: tuple[tuple[str, AdaptConfig, int], tuple[Priors, WeightsChange, float, int]] | None = None
+        self._last: tuple[tuple[str, AdaptConfig, int], tuple[RoundInputs, WeightsChange, float, int]] | None = None
 
     def cell(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult | None:
         """The cell's result, kept or new; None if it is not there and nothing is to be run."""
@@ -171,12 +170,12 @@ class _Worker:
             case = self.case(grade)
             reconstruction = case.backbone
         if config is not None and case is not None:
-            priors, weights, seconds, steps = self._adapted(grade, case, config, seed)
+            inputs, weights, seconds, steps = self._adapted(grade, case, config, seed)
             started = time.perf_counter()
-            state, reconstruction = finished_round(case.inputs, priors, weights, self.loaded, config, seed=seed)
+            state, reconstruction = finished_round(inputs, weights, self.loaded, config, seed=seed)
             reconstruction = self._refined(reconstruction, state.views, config, seed)
             seconds += time.perf_counter() - started
-            before = case.inputs.state
+            before = inputs.state
             without = reconstruct(before.views, before.priors, self.loaded, state.weights, method="alone")
             alone = self._numbers(self._refined(without, before.views, config, seed), None)
         return CellResult(
@@ -199,15 +198,15 @@ class _Worker:
 
     def _adapted(
         self, grade: str, case: PreparedCase, config: AdaptConfig, seed: int
-    ) -> tuple[Priors, WeightsChange, float, int]:
-        """(priors, weights, seconds, steps) of Algorithm 1 alone: rows that differ in what follows it share it. The last one is kept."""
+    ) -> tuple[RoundInputs, WeightsChange, float, int]:
+        """(aligned inputs, weights, seconds, steps) of Algorithm 1 alone: rows that differ in what follows share it. The last is kept."""
         shared = replace(config, trust=False, splat_steps=0)
         key = grade, shared, seed
         if self._last is None or self._last[0] != key:
             started = time.perf_counter()
-            priors = realigned_priors(case.inputs, self.loaded, config.realign, seed=seed)
-            weights, result = adapted_weights(case.inputs, priors, self.loaded, config, seed=seed)
-            self._last = key, (priors, weights, time.perf_counter() - started, len(result.records))
+            inputs = aligned(case.inputs, self.loaded, config, seed=seed)
+            weights, result = adapted_weights(inputs, self.loaded, config, seed=seed)
+            self._last = key, (inputs, weights, time.perf_counter() - started, len(result.records))
         return self._last[1]
 
     def _numbers(self, reconstruction: Reconstruction, case: PreparedCase | None) -> BenchNumbers:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from sceneexpander.adaptation.gaussian_head import fit_gaussian_head
 from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, StepRecord, adapt
 from sceneexpander.adaptation.observe import Look
 from sceneexpander.adaptation.realign import realign
+from sceneexpander.adaptation.tone import match_tone
 from sceneexpander.adaptation.warmup import WarmupConfig, WarmupReport, warm_up
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView
@@ -32,6 +34,8 @@ from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.protocol import Prediction
 from sceneexpander.optimisation.refine import RefineConfig, RefineReport, refine
 from sceneexpander.splatting import render
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,10 +163,9 @@ def adapt_round(
     looks_folder: Path | None = None,
 ) -> tuple[ExpansionState, Reconstruction, AdaptationResult]:
     """Algorithm 1, then the expanded scene with the adapted weights: the state that the next round starts from."""
-    priors = realigned_priors(inputs, loaded, config.realign, seed=seed)
+    inputs = aligned(inputs, loaded, config, seed=seed)
     weights, result = adapted_weights(
         inputs,
-        priors,
         loaded,
         config,
         seed=seed,
@@ -171,12 +174,41 @@ def adapt_round(
         on_look=on_look,
         looks_folder=looks_folder,
     )
-    return *finished_round(inputs, priors, weights, loaded, config, seed=seed), result
+    return *finished_round(inputs, weights, loaded, config, seed=seed), result
+
+
+def aligned(inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig, *, seed: int) -> RoundInputs:
+    """What the adaptation takes instead of the given estimate and picture: `realigned_priors`, and the photos' tone (`match_tone`)."""
+    inputs = replace(inputs, joint_priors=realigned_priors(inputs, loaded, config.realign, seed=seed))
+    return toned(inputs, loaded) if config.tone else inputs
+
+
+def toned(inputs: RoundInputs, loaded: LoadedModel) -> RoundInputs:
+    """The inserted picture in the photos' tone, by the geometry of the weights that the round starts from."""
+    inserted = inputs.inserted
+    views = inputs.state.views.append(inserted.view)
+    seen = predict(views, inputs.joint_priors, loaded, inputs.state.weights)
+    if seen.depth is None:
+        raise ValueError("the tone is compared by means of the depth head")
+    tone = match_tone(
+        views.images,
+        seen.depth.cpu(),
+        seen.world_from_cam.cpu(),
+        seen.intrinsics_px.cpu(),
+        generated=views.generated,
+        view=len(views) - 1,
+    )
+    if tone is None:
+        _log.info("the inserted view shares too little with the photos to compare their tone")
+        return inputs
+    _log.info("the inserted picture x (%.2f, %.2f, %.2f) has the photos' tone", *tone.gains)
+    view = inserted.view
+    changed = replace(view, images=tone.applied(view.images), detail_images=tone.applied(view.detail_images))
+    return replace(inputs, inserted=replace(inserted, view=changed))
 
 
 def adapted_weights(
     inputs: RoundInputs,
-    joint_priors: Priors,
     loaded: LoadedModel,
     config: AdaptConfig,
     *,
@@ -186,7 +218,7 @@ def adapted_weights(
     on_look: Callable[[Look], None] | None = None,
     looks_folder: Path | None = None,
 ) -> tuple[WeightsChange, AdaptationResult]:
-    """Algorithm 1 with the given priors of all views (see `realigned_priors`)."""
+    """Algorithm 1 alone, on inputs as `aligned` leaves them."""
     state = inputs.state
     loaded.apply(state.weights)
     result = adapt(
@@ -196,7 +228,7 @@ def adapted_weights(
             inserted=inputs.inserted.view.images[0].to(loaded.device),
             anchors=_device_anchors(inputs.anchors, loaded),
             captured_priors=_device_priors(state.priors, loaded),
-            joint_priors=_device_priors(joint_priors, loaded),
+            joint_priors=_device_priors(inputs.joint_priors, loaded),
         ),
         config,
         seed=seed,
@@ -210,16 +242,10 @@ def adapted_weights(
 
 
 def finished_round(
-    inputs: RoundInputs,
-    joint_priors: Priors,
-    weights: WeightsChange,
-    loaded: LoadedModel,
-    config: AdaptConfig,
-    *,
-    seed: int,
+    inputs: RoundInputs, weights: WeightsChange, loaded: LoadedModel, config: AdaptConfig, *, seed: int
 ) -> tuple[ExpansionState, Reconstruction]:
     """The expanded scene with adapted weights, after what may follow Algorithm 1: the Gaussian head, and fading."""
-    views = inputs.state.views.append(inputs.inserted.view)
+    views, joint_priors = inputs.state.views.append(inputs.inserted.view), inputs.joint_priors
     if config.splat_steps:
         loaded.apply(weights)
         fit_gaussian_head(

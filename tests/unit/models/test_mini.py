@@ -369,16 +369,27 @@ def test_weights_survive_half_precision_and_a_wrong_file_is_refused(tmp_path: Pa
         Mini.from_weights(tmp_path / "other.safetensors")
 
 
-def test_the_shipped_weights_are_small_and_no_worse_than_the_base(held_out: list[Sample]) -> None:
+@pytest.fixture(scope="module")
+def larger_held_out() -> list[Sample]:
+    """As `held_out`, of the smallest size that the shipped weights were trained at: smaller pictures have another base."""
+    samples = []
+    for seed in range(41, 47):
+        views = make_views(seed, views=4, height=168, width=224, split="test", supersample=1.0)
+        conditions = Conditions(rotation_deg=0.05, baseline_fraction=0.005)
+        samples.append(sample_of_scene(views, 3, conditions, torch.Generator().manual_seed(seed)))
+    return samples
+
+
+def test_the_shipped_weights_are_small_and_better_than_the_base(larger_held_out: list[Sample]) -> None:
     model = Mini.from_weights("builtin")
     path = Path(__file__).parents[3] / "src/sceneexpander/models/mini/weights/mini.safetensors"
     assert path.stat().st_size <= 25e6
-    rows = [geometry_row(model, sample) for sample in held_out]
-    for name, slack in (("abs_rel", 0.005), ("normals_deg", 0.0)):
+    rows = [geometry_row(model, sample) for sample in larger_held_out]
+    for name in ("abs_rel", "normals_deg"):
         network, base = (sum(row[f"{who}/{name}"] for row in rows) / len(rows) for who in ("network", "base"))
-        assert network <= base + slack, (name, network, base)
+        assert network <= base, (name, network, base)
     within, base_within = (sum(row[f"{who}/within"] for row in rows) / len(rows) for who in ("network", "base"))
-    assert within >= base_within - 0.005
+    assert within >= base_within
 
 
 def test_a_stored_sample_is_the_sample(held_out: list[Sample], tmp_path: Path) -> None:
