@@ -15,8 +15,7 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
-from sceneexpander.geometry.lookup import project_to_views, sample_at
-from sceneexpander.geometry.rigid import rigid_inverse
+from sceneexpander.geometry.lookup import seen_at
 from sceneexpander.models.protocol import Prediction
 from sceneexpander.splatting import render
 
@@ -48,7 +47,7 @@ def agreement(
 ) -> Agreement:
     """Compare points with the captured views' depth maps, all in one frame and scale."""
     points = points_world.reshape(-1, 3)
-    there, z, in_frame = _seen_at(
+    there, z, in_frame = seen_at(
         points, captured_depth[:, None], captured_world_from_cam, captured_intrinsics_px, "nearest"
     )
     ratio = torch.where(in_frame, (z / there[:, 0].clamp(min=1e-6)).log(), torch.inf)
@@ -177,7 +176,7 @@ def _filled_by_captured(
         camera = world_from_cam[view][None], intrinsics_px[view][None]
         alpha = render(taken, *camera, height, width).alpha
         own = sources == view
-        there, _, in_frame = _seen_at(points[own], alpha[:, None], *camera, "bilinear")
+        there, _, in_frame = seen_at(points[own], alpha[:, None], *camera, "bilinear")
         filled[own] = torch.where(in_frame[0], there[0, 0], 0.0).clamp(0, 1)
     return filled
 
@@ -193,21 +192,8 @@ def colour_difference(
 ) -> Float[Tensor, "point"]:
     """Mean absolute RGB difference of points to the captured view that fits best of those that see them; 0 where none does."""
     content = torch.cat([captured_images, captured_depth[:, None]], dim=1)
-    there, z, in_frame = _seen_at(points_world, content, captured_world_from_cam, captured_intrinsics_px, "bilinear")
+    there, z, in_frame = seen_at(points_world, content, captured_world_from_cam, captured_intrinsics_px, "bilinear")
     visible = in_frame & ((z / there[:, 3].clamp(min=1e-6)).log() < _HIDDEN)
     off = (there[:, :3] - colours.T).abs().mean(1)
     best = torch.where(visible, off, torch.inf).amin(0)
     return torch.where(best.isfinite(), best, 0.0)
-
-
-def _seen_at(
-    points_world: Float[Tensor, "point 3"],
-    content: Float[Tensor, "view channel height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
-    mode: str,
-) -> tuple[Float[Tensor, "view channel point"], Float[Tensor, "view point"], Bool[Tensor, "view point"]]:
-    """(views' content where the points project, the points' depth there, whether they are in frame)."""
-    height, width = content.shape[-2:]
-    grid, z, in_frame = project_to_views(points_world, rigid_inverse(world_from_cam), intrinsics_px, height, width)
-    return sample_at(content, grid, mode), z, in_frame

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from sceneexpander.adaptation.consistency import SAME_SURFACE
 from sceneexpander.geometry.camera import unproject_to_world
-from sceneexpander.geometry.lookup import project_to_views, sample_at
-from sceneexpander.geometry.rigid import rigid_inverse
+from sceneexpander.geometry.lookup import seen_at
 
 LEAST_SHARE = 0.01  # of the inserted view's pixels that have to be seen in a photo
 DARKEST, BRIGHTEST = 0.06, 0.94  # display values beyond which noise and clipping say nothing about gains
@@ -76,10 +75,8 @@ def match_tone(
     if len(photos) == 0:
         return None
     points = unproject_to_world(depth[one], intrinsics_px[one], world_from_cam[one]).reshape(-1, 3)
-    grid, z, in_frame = project_to_views(
-        points, rigid_inverse(world_from_cam[photos]), intrinsics_px[photos], height, width
-    )
-    there = sample_at(torch.cat([images[photos], depth[photos, None]], dim=1), grid)
+    content = torch.cat([images[photos], depth[photos, None]], dim=1)
+    there, z, in_frame = seen_at(points, content, world_from_cam[photos], intrinsics_px[photos], "bilinear")
     ratio = (z / there[:, 3].clamp(min=1e-6)).log()
     mine = images[view].flatten(1).expand(len(photos), -1, -1)
     usable = in_frame & (ratio.abs() < SAME_SURFACE)

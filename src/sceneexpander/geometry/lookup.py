@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.geometry.rigid import transform_points
+from sceneexpander.geometry.rigid import rigid_inverse, transform_points
 
 _NEAREST = 1e-6  # depth below which a point has no place in a view
 
@@ -40,3 +40,16 @@ def sample_at(
         content, grid[:, :, None], mode=mode, padding_mode="border", align_corners=False
     )
     return sampled[..., 0]
+
+
+def seen_at(
+    points_world: Float[Tensor, "point 3"],
+    content: Float[Tensor, "view channel height width"],
+    world_from_cam: Float[Tensor, "view 4 4"],
+    intrinsics_px: Float[Tensor, "view 3 3"],
+    mode: str,
+) -> tuple[Float[Tensor, "view channel point"], Float[Tensor, "view point"], Bool[Tensor, "view point"]]:
+    """(views' content where the points project, the points' depth there, whether they are in frame)."""
+    height, width = content.shape[-2:]
+    grid, z, in_frame = project_to_views(points_world, rigid_inverse(world_from_cam), intrinsics_px, height, width)
+    return sample_at(content, grid, mode), z, in_frame

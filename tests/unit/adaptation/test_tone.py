@@ -73,8 +73,9 @@ def test_generated_views_and_strangers_have_no_say(views: SyntheticViews) -> Non
 
 
 def test_another_scene_is_not_taken_for_another_exposure(views: SyntheticViews) -> None:
-    found = matched(views, recoloured(views, (0.2, 0.2, 0.2)))
-    assert found is None or max(found.gains) <= LARGEST_GAIN + 1e-6
+    found = matched(views, recoloured(views, (0.4, 0.4, 0.4)))  # would take a gain of 2.5
+    assert found is not None
+    assert found.gains == pytest.approx((LARGEST_GAIN,) * 3)
 
 
 def test_what_is_clipped_to_white_stays_white() -> None:

@@ -44,7 +44,7 @@ class Sample:
     sparse_log_depth: Float[Tensor, "view height width"]  # interpolation of the sparse points, the trivial baseline
     evidence: Float[Tensor, "view channel height width"]
     posed: Bool[Tensor, "view"]
-    wrong_focal: bool
+    wrong_focal: bool  # or estimated cameras: the prior's frame and the true one differ by more than pose noise
     kind: str
     seed: int
 
