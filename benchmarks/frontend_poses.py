@@ -27,6 +27,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from sceneexpander.frontend.dense import DenseConfig
+from sceneexpander.frontend.prior import picture_judge
 from sceneexpander.frontend.sfm import SfmConfig, SparseReconstruction, estimate_cameras
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.synthetic import make_views
@@ -71,7 +73,8 @@ def measure(
 ) -> Row:
     """Estimate the cameras of one set and compare them with the truth where there is one."""
     start = time.process_time()
-    found = estimate_cameras(images, config, generator=torch.Generator().manual_seed(0))
+    judge = picture_judge(images, DenseConfig(threads=1))
+    found = estimate_cameras(images, config, generator=torch.Generator().manual_seed(0), judge=judge)
     spent = time.process_time() - start
     rotation, translation = ((), ()) if truth is None else pair_errors(found, truth)
     report = found.report

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-_IGNORED_SUFFIXES = frozenset({".py", ".pyc", ".pyi", ".so", ".typed"})
+_IGNORED_SUFFIXES = frozenset({".py", ".pyc", ".pyi", ".so", ".typed", ".md"})
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 

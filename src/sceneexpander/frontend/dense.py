@@ -1,9 +1,9 @@
-"""Dense depth of posed views by classical multi-view stereo, with a calibrated mask of where to believe it.
+"""Dense depth of posed views by classical multi-view stereo, with a calibrated probability that it is right.
 
 Per view: plane sweep over inverse depth (`dense_sweep`), semi-global matching (`sgm`), per-pixel refinement; then a check
-across views (`dense_check`) that yields the confident mask; then planes per colour segment and edge-aware smoothing (`fill`)
-until every pixel has a depth. Views that cannot be matched (no pose, no sparse points, pure rotation, no partner) get the
-interpolation of what is known, and no confident pixel.
+across views (`dense_check`); then planes per colour segment and edge-aware smoothing (`fill`), which believe the checked pixels,
+until every pixel has a depth; and from all that evidence how likely each depth is right (`confidence`). Views that cannot be
+matched (no pose, no sparse points, pure rotation, no partner) get the interpolation of what is known, and no confidence.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sceneexpander.frontend.confidence import confidence_features, shipped_model
 from sceneexpander.frontend.dense_check import Agreement, check_view, without_small_parts
 from sceneexpander.frontend.dense_sweep import WORST_COST, WindowMatcher, sweep_offsets, sweep_planes
 from sceneexpander.frontend.dense_views import (
@@ -66,8 +67,9 @@ class DenseConfig:
     refine_reach: float = 1.2  # the outermost of them, in planes
     reprojection_px: float = 1.5  # cross-view check: largest distance after going there and back
     depth_tolerance: float = 0.04  # and largest relative difference of depth
-    max_cost: float = 0.6  # a confident pixel must match better than this
-    min_part_px: int = 20  # smaller confident islands are dropped (at 320 pixels; scaled by area)
+    max_cost: float = 0.6  # a checked pixel must match better than this
+    min_part_px: int = 20  # smaller checked or confident islands are dropped (at 320 pixels; scaled by area)
+    min_confidence: float = 0.6  # probability of being within 5 % from which a pixel counts as confident
     segment_tolerances: tuple[float, ...] = (0.8, 2.0)  # colour segments, fine and coarse
     min_segment_px: int = 40  # smallest segment (at 320 pixels; scaled by area)
     plane_tolerance: float = 0.1  # relative error at which a sample stops supporting a segment's plane
@@ -76,11 +78,11 @@ class DenseConfig:
     smooth_reach: float = 0.054  # reach of the final fill as a share of the long side
     stiffness: float = 4.0  # smoothness of the final fill against weights of 1
     colour_sigma: float = 0.04  # colour step that stops the final fill
-    weight_agreed: float = 1.0  # confident, two or more other views agree
-    weight_confident: float = 0.6  # confident, one other view agrees
-    weight_raw: float = 0.001  # matched but not confident
+    weight_agreed: float = 1.0  # checked, two or more other views agree
+    weight_checked: float = 0.6  # checked, one other view agrees
+    weight_raw: float = 0.001  # matched but not checked
     weight_point: float = 30.0  # sparse points: one speaks for the plain area around it, too
-    point_conflict: float = 0.1  # sparse points this far (log depth) from confident pixels around them are dropped
+    point_conflict: float = 0.1  # sparse points this far (log depth) from checked pixels around them are dropped
     weight_interpolation: float = 0.003  # interpolation of the sparse points
 
 
@@ -93,8 +95,18 @@ class DenseDepth:
     """
 
     depth: Float[Tensor, "view height width"]  # z-depth in the scale of the poses, > 0 everywhere
-    confident: Bool[Tensor, "view height width"]  # the cross-view check passed
+    confidence: Float[Tensor, "view height width"]  # probability that the depth is within 5 % of the truth; 0 unmatched
+    confident: Bool[Tensor, "view height width"]  # where that is at least `DenseConfig.min_confidence`
     evidence: Float[Tensor, "view channel height width"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Filled:
+    """Final result of one view, at the working resolution."""
+
+    depth: Image32
+    confidence: Image32
+    evidence: NDArray[np.float32]  # (channel, height, width); pixel lengths are those of the working resolution
 
 
 @dataclass(slots=True)
@@ -127,6 +139,26 @@ def dense_depth(
     Raises:
         ValueError: shapes that do not belong together.
     """
+    views, matched, interpolated, limits = _match_views(images, world_from_cam, intrinsics_px, sparse, config, posed)
+    depths = [None if m is None else np.reciprocal(m.inverse_depth) for m in matched]
+
+    def finish(s: int) -> _Filled:
+        agreement = None if depths[s] is None else _agreement(views, depths, s, config)
+        return _fill_view(views, s, matched[s], agreement, interpolated[s], limits[s], config)
+
+    finished = _each(finish, len(views), config.threads)
+    return _assemble(finished, (images.shape[-2], images.shape[-1]))
+
+
+def _match_views(
+    images: Float[Tensor, "view 3 height width"],
+    world_from_cam: Float[Tensor, "view 4 4"],
+    intrinsics_px: Float[Tensor, "view 3 3"],
+    sparse: SparsePoints,
+    config: DenseConfig,
+    posed: Bool[Tensor, "view"] | None,
+) -> tuple[list[WorkView], list[_Matched | None], list[Image32], list[tuple[float, float]]]:
+    """(views at the working resolution, raw matches, interpolations of the points, limits of inverse depth)."""
     count = images.shape[0]
     if world_from_cam.shape[0] != count or intrinsics_px.shape[0] != count:
         raise ValueError(f"{count} images, {world_from_cam.shape[0]} poses and {intrinsics_px.shape[0]} intrinsics")
@@ -141,23 +173,40 @@ def dense_depth(
     def match(s: int) -> _Matched | None:
         return _match_view(views, s, limits[s], interpolated[s], config)
 
-    matched = _each(match, count, config.threads)
+    return views, _each(match, count, config.threads), interpolated, limits
+
+
+def _agreement(views: list[WorkView], depths: list[Image32 | None], s: int, config: DenseConfig) -> Agreement:
+    """What the other views say about the raw depth of a view."""
+    return check_view(views, depths, s, reprojection_px=config.reprojection_px, depth_tolerance=config.depth_tolerance)
+
+
+def _checked(matched: _Matched, agreement: Agreement, config: DenseConfig) -> NDArray[np.bool_]:
+    """Pixels of a view that match well and that another view confirms; small islands are chance."""
+    checked = (agreement.agreeing >= 1) & (matched.cost < config.max_cost)
+    checked &= agreement.parallax > config.min_parallax_px
+    area = (max(checked.shape) / _FULL_SIZE_PX) ** 2
+    return without_small_parts(checked, max(1, round(config.min_part_px * area)))
+
+
+def checked_share(
+    images: Float[Tensor, "view 3 height width"],
+    world_from_cam: Float[Tensor, "view 4 4"],
+    intrinsics_px: Float[Tensor, "view 3 3"],
+    sparse: SparsePoints,
+    config: DenseConfig,
+    *,
+    posed: Bool[Tensor, "view"],
+) -> float:
+    """Share of all pixels that match another view and lead back: how well cameras fit the pictures. Arguments as `dense_depth`."""
+    views, matched = _match_views(images, world_from_cam, intrinsics_px, sparse, config, posed)[:2]
     depths = [None if m is None else np.reciprocal(m.inverse_depth) for m in matched]
-
-    def finish(s: int) -> tuple[Image32, NDArray[np.float32]]:
-        agreement = None
-        if depths[s] is not None:
-            agreement = check_view(
-                views,
-                depths,
-                s,
-                reprojection_px=config.reprojection_px,
-                depth_tolerance=config.depth_tolerance,
-            )
-        return _fill_view(views, s, matched[s], agreement, interpolated[s], limits[s], config)
-
-    finished = _each(finish, count, config.threads)
-    return _assemble(finished, (height, width))
+    share = 0.0
+    for s, found in enumerate(matched):
+        if found is not None:
+            agreement = _agreement(views, depths, s, config)
+            share += float(_checked(found, agreement, config).mean()) / len(views)
+    return share
 
 
 def _each(work: Callable[[int], Result], count: int, threads: int) -> list[Result]:
@@ -237,24 +286,22 @@ def _fill_view(
     interpolated: Image32,
     limits: tuple[float, float],
     config: DenseConfig,
-) -> tuple[Image32, NDArray[np.float32]]:
-    """Final depth (height, width) and evidence (channel, height, width) of one view, at the working resolution."""
+) -> _Filled:
+    """Depth, evidence and confidence of one view."""
     view = views[s]
     shape = view.grey.shape
     area = (max(shape) / _FULL_SIZE_PX) ** 2
-    confident = np.zeros(shape, bool)
+    checked = np.zeros(shape, bool)
     value = interpolated.copy()
     weight = np.full(shape, config.weight_interpolation, np.float32)
     if matched is not None and agreement is not None:
-        confident = (agreement.agreeing >= 1) & (matched.cost < config.max_cost)
-        confident &= agreement.parallax > config.min_parallax_px
-        confident = without_small_parts(confident, max(1, round(config.min_part_px * area)))
-        trust = np.where(agreement.agreeing >= 2, config.weight_agreed, config.weight_confident)
-        trust = np.where(confident, trust, config.weight_raw).astype(np.float32)
+        checked = _checked(matched, agreement, config)
+        trust = np.where(agreement.agreeing >= 2, config.weight_agreed, config.weight_checked)
+        trust = np.where(checked, trust, config.weight_raw).astype(np.float32)
         value, weight = _blend(value, weight, np.log(matched.inverse_depth), trust)
-    known = np.where(confident, weight, 0).astype(np.float32)
+    known = np.where(checked, weight, 0).astype(np.float32)
     known_value = value.copy()
-    row, column, log_inverse = _credible_points(view, confident, value, config.point_conflict)
+    row, column, log_inverse = _credible_points(view, checked, value, config.point_conflict)
     if len(row):
         known_value[row, column], known[row, column] = log_inverse, config.weight_point
         value, weight = _blend(value, weight, *_spread_points(row, column, log_inverse, config.weight_point, shape))
@@ -274,22 +321,26 @@ def _fill_view(
     filled = smooth_fill(
         value, weight, view.rgb, reach_px=reach, stiffness=config.stiffness, colour_sigma=config.colour_sigma
     )
-    return np.exp(-filled), _evidence(
-        view, matched, agreement, confident=confident, score=score, filled=filled, interpolated=interpolated
-    )
+    evidence = _evidence(view, matched, agreement, score=score, filled=filled, interpolated=interpolated)
+    confidence = np.zeros(shape, np.float32)
+    if matched is not None and agreement is not None:
+        confidence = shipped_model()(confidence_features(evidence, agreement.agreeing))
+    confident = without_small_parts(confidence >= config.min_confidence, max(1, round(config.min_part_px * area)))
+    evidence[EVIDENCE_CHANNELS.index("confident")] = confident
+    return _Filled(np.exp(-filled), confidence, evidence)
 
 
 def _credible_points(
-    view: WorkView, confident: NDArray[np.bool_], log_inverse_depth: Image32, conflict: float
+    view: WorkView, checked: NDArray[np.bool_], log_inverse_depth: Image32, conflict: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Image32]:
-    """(row, column, log inverse depth) of the sparse points that agree with the confident pixels around them.
+    """(row, column, log inverse depth) of the sparse points that agree with the checked pixels around them.
 
-    A point is judged only where more than half of the 5x5 pixels are confident: beside a depth edge both may be right.
+    A point is judged only where more than half of the 5x5 pixels are checked: beside a depth edge both may be right.
     """
     column, row = view.seen_xy[:, 0].astype(np.int64), view.seen_xy[:, 1].astype(np.int64)
     log_inverse = -np.log(view.seen_depth).astype(np.float32)
-    share = cv2.blur(confident.astype(np.float32), (5, 5))
-    nearby = cv2.blur(np.where(confident, log_inverse_depth, 0).astype(np.float32), (5, 5)) / np.maximum(share, 1e-6)
+    share = cv2.blur(checked.astype(np.float32), (5, 5))
+    nearby = cv2.blur(np.where(checked, log_inverse_depth, 0).astype(np.float32), (5, 5)) / np.maximum(share, 1e-6)
     contradicted = (share[row, column] > 0.5) & (np.abs(nearby[row, column] - log_inverse) > conflict)
     keep = ~contradicted
     return row[keep], column[keep], log_inverse[keep]
@@ -319,48 +370,51 @@ def _evidence(
     matched: _Matched | None,
     agreement: Agreement | None,
     *,
-    confident: NDArray[np.bool_],
     score: Image32,
     filled: Image32,
     interpolated: Image32,
 ) -> NDArray[np.float32]:
-    """The channels of `EVIDENCE_CHANNELS`; counts and pixel lengths still in units of the working resolution."""
+    """The channels of `EVIDENCE_CHANNELS`; "confident" is still empty, "agreeing" a count, lengths of the working resolution."""
     shape = view.grey.shape
     none = np.zeros(shape, np.float32)
     channels: dict[str, NDArray[np.float32]] = {
-        "confident": confident.astype(np.float32),
+        "confident": none,
         "agreeing": none if agreement is None else agreement.agreeing,
         "cost": np.full(shape, WORST_COST, np.float32) if matched is None else matched.cost,
         "ambiguity": np.ones(shape, np.float32) if matched is None else matched.ambiguity,
-        "parallax": none if agreement is None else agreement.parallax,
+        "parallax": none if agreement is None else np.log1p(agreement.parallax),
         "plane": score,
         "gap": none if matched is None else np.clip(filled - np.log(matched.inverse_depth), -1, 1),
         "sparse": np.clip(filled - interpolated, -1, 1),
-        "distance": pixels_to_nearest(view.seen_xy, shape),
+        "distance": np.log1p(pixels_to_nearest(view.seen_xy, shape)),
     }
     return np.stack([channels[name] for name in EVIDENCE_CHANNELS])
 
 
-def _assemble(finished: list[tuple[Image32, NDArray[np.float32]]], size: tuple[int, int]) -> DenseDepth:
+def _assemble(finished: list[_Filled], size: tuple[int, int]) -> DenseDepth:
     """Results of all views at the size of the given images."""
     height, width = size
     count = len(finished)
     channels = {name: k for k, name in enumerate(EVIDENCE_CHANNELS)}
-    depth = np.empty((count, height, width), np.float32)
+    depth, confidence = (np.empty((count, height, width), np.float32) for _ in range(2))
     evidence = np.empty((count, len(channels), height, width), np.float32)
-    for s, (work_depth, work_evidence) in enumerate(finished):
+    for s, view in enumerate(finished):
+        work_depth, work_evidence = view.depth, view.evidence
         pixels = max(size) / max(work_depth.shape)
         work_evidence[channels["agreeing"]] /= max(count - 1, 1)
         for name in ("parallax", "distance"):
-            work_evidence[channels[name]] = np.log1p(work_evidence[channels[name]] * np.float32(pixels))
+            lengths = np.expm1(work_evidence[channels[name]]) * np.float32(pixels)
+            work_evidence[channels[name]] = np.log1p(lengths)
         if work_depth.shape == size:
-            depth[s], evidence[s] = work_depth, work_evidence
+            depth[s], confidence[s], evidence[s] = work_depth, view.confidence, work_evidence
             continue
         depth[s] = np.exp(cv2.resize(np.log(work_depth), (width, height), interpolation=cv2.INTER_LINEAR))
+        confidence[s] = cv2.resize(view.confidence, (width, height), interpolation=cv2.INTER_LINEAR)
         for k in range(len(channels)):
             evidence[s, k] = cv2.resize(work_evidence[k], (width, height), interpolation=cv2.INTER_NEAREST)
     return DenseDepth(
         depth=torch.from_numpy(depth),
+        confidence=torch.from_numpy(confidence),
         confident=torch.from_numpy(evidence[:, channels["confident"]] > 0.5),
         evidence=torch.from_numpy(evidence),
     )

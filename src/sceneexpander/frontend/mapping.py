@@ -312,9 +312,12 @@ def solve_pose(
     """
     if len(points) < 6:
         return None
-    found, _, vector, translation, _ = cv2.solvePnPRansac(
-        points, pixel_xy, intrinsics.copy(), None, params=usac_parameters(threshold_px, seed)
-    )
+    try:
+        found, _, vector, translation, _ = cv2.solvePnPRansac(
+            points, pixel_xy, intrinsics.copy(), None, params=usac_parameters(threshold_px, seed)
+        )
+    except cv2.error:  # as in `twoview`: degenerate samples can leave the local optimisation without a model
+        return None
     if not found or not (np.isfinite(vector).all() and np.isfinite(translation).all()):
         return None
     rotation, translation = cv2.Rodrigues(vector)[0], translation.ravel()

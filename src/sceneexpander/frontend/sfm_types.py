@@ -19,6 +19,7 @@ class LearnedUse(StrEnum):
     NEVER = "never"
     RESCUE = "rescue"  # only if SIFT leaves a view out of the model, and kept only if that brings one in
     ALWAYS = "always"
+    CHOOSE = "choose"  # models with and without, and whoever asks for cameras judges them; else like RESCUE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,10 +42,16 @@ class SfmConfig:
     guided_ratio: float = 0.85
     guided_max_distance: float = 0.7  # of unit descriptors
 
-    learned: LearnedUse = LearnedUse.RESCUE
+    learned: LearnedUse = LearnedUse.CHOOSE
+    choose_most_views: int = (
+        8  # more views than this are not chosen among: wrong models of many views are rare, and dear
+    )
     learned_features: int = 2048  # per view
     learned_long_side_px: int = 1024
     learned_min_expected: float = 20.0  # matches that must be expected to be right, or two views share nothing
+    learned_candidates: int = (
+        8  # of each view that SIFT has left out: the others it is matched with, by their descriptors
+    )
     learned_neighbours: int = 4  # of each view that SIFT has connected: the others it is matched with
 
     # Verification of pairs.

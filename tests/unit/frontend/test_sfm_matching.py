@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import sfm_worlds as worlds
 
 from sceneexpander.frontend.bundle import rotation_exp
 from sceneexpander.frontend.features import Features, detect_features, grey_u8
+from sceneexpander.frontend.mapping import solve_pose
 from sceneexpander.frontend.matching import Matches, guided_matches, mutual_matches, similarity
 from sceneexpander.frontend.sfm_types import SfmConfig
 from sceneexpander.frontend.tracks import build_tracks
 from sceneexpander.frontend.twoview import (
     PairMatches,
     distinct_positions,
+    epipolar_distance,
     fit_fundamental,
     fit_rotation,
+    fundamental_from_poses,
     homogeneous_rays,
     relative_pose,
     rotation_focal,
@@ -213,3 +217,35 @@ def test_no_matches_make_no_tracks() -> None:
     features = [random_features(0, 4), random_features(1, 0)]
     assert build_tracks(features, []).count == 0
     assert build_tracks(features, []).seen.shape == (0, 2)
+
+
+def test_a_robust_fit_that_gives_up_is_no_match(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV raises when its local optimisation is left without a model; that must not end a reconstruction."""
+
+    def give_up(*_: object, **__: object) -> None:
+        raise cv2.error("(-215:Assertion failed) !model.empty() in function 'setModelParameters'")
+
+    for name in ("findFundamentalMat", "findEssentialMat", "findHomography", "solvePnPRansac"):
+        monkeypatch.setattr(cv2, name, give_up)
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(0, 300, (2, 40, 2))
+    camera = np.array([[300.0, 0, 150], [0, 300.0, 150], [0, 0, 1]])
+    assert fit_fundamental(a, b, SfmConfig(), unit_px=1.0, seed=0) is None
+    assert relative_pose(a, b, camera, camera, threshold_px=1.0, seed=0) is None
+    assert rotation_focal(a, b, camera, (0.5, 2.0), threshold_px=1.0, seed=0) is None
+    points = rng.uniform(1, 2, (40, 3))
+    assert solve_pose(points, a, camera, threshold_px=1.0, robust_px=1.0, seed=0) is None
+
+
+def test_the_epipolar_distance_is_zero_for_exact_matches_and_grows_with_the_error() -> None:
+    world = worlds.point_world(0, views=2)
+    rotation = world.rotations[1] @ world.rotations[0].T
+    translation = world.translations[1] - rotation @ world.translations[0]
+    fundamental = fundamental_from_poses(rotation, translation, *world.intrinsics)
+    a, b = world.pixel_xy[:, 0], world.pixel_xy[:, 1]
+    np.testing.assert_allclose(epipolar_distance(fundamental, a, b), 0, atol=1e-6)
+    # Across the line of b by 3 px: exactly 3 px from that line.
+    lines = np.concatenate([a, np.ones((len(a), 1))], 1) @ fundamental.T
+    normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    moved = epipolar_distance(fundamental, a, b + 3 * normals)
+    assert (moved >= 3 - 1e-6).all()

@@ -24,6 +24,7 @@ from sceneexpander.models.mini.training.generate import (
     Conditions,
     GeneratorConfig,
     in_scale_of_base,
+    input_photos,
     own_cameras_sample,
     sample_of_scene,
     training_sample,
@@ -447,13 +448,29 @@ def test_truth_takes_the_scale_of_the_base(held_out: list[Sample]) -> None:
 
 def test_own_cameras_are_those_of_the_front_end_and_truth_stays_true(held_out: list[Sample]) -> None:
     sample = held_out[0]
-    own = own_cameras_sample(sample, torch.Generator().manual_seed(0), DenseConfig(threads=1))
+    photos = torch.nn.functional.interpolate(sample.input_images, scale_factor=2, mode="bilinear", antialias=True)
+    own = own_cameras_sample(sample, photos, torch.Generator().manual_seed(0), DenseConfig(threads=1))
     assert own.wrong_focal
     assert torch.equal(own.images, sample.images)
     assert not torch.equal(own.prior_intrinsics_px, sample.prior_intrinsics_px)
     shift = own.log_depth - sample.log_depth
     assert float(shift[sample.valid].std()) < 1e-5, "one factor for the whole scene"
     assert torch.equal(own.prior_world_from_cam[0], torch.eye(4))
+
+
+def test_photos_of_a_sample_are_its_views_drawn_larger() -> None:
+    for seed in range(30):
+        scene = make_views(seed, views=4, height=84, width=112)
+        if scene.disconnected is not None and scene.disconnected < 2:
+            break
+    sample = sample_of_scene(scene, 3, Conditions(), torch.Generator().manual_seed(0))
+    photos = input_photos(scene, sample, supersample=1.0)
+    assert photos.shape == (3, 3, 168, 224)
+    shrunk = torch.nn.functional.avg_pool2d(photos, 2)
+    for view in range(3):
+        difference = [float((shrunk[view] - other).abs().mean()) for other in sample.input_images]
+        assert difference.index(min(difference)) == view, "in the order of the sample, the lonely view last"
+        assert min(difference) < 0.05  # exposure, noise and JPEG are drawn anew
 
 
 def test_a_share_of_the_training_scenes_runs_the_whole_front_end() -> None:

@@ -38,7 +38,7 @@ class MeasuredPriors:
     intrinsics_px: Float[Tensor, "view 3 3"]
     depth: Float[Tensor, "view height width"]  # > 0 everywhere
     known: Bool[Tensor, "view height width"] | None  # where there is a base depth; None: everywhere
-    confident: Float[Tensor, "view height width"]  # 1 where the cross-view check passed
+    confident: Float[Tensor, "view height width"]  # 1 where the base is probably right
     posed: Bool[Tensor, "view"]
     log_depth_fine: Float[Tensor, "view height width"]  # at the working resolution
     confident_fine: Float[Tensor, "view height width"]

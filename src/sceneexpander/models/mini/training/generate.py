@@ -18,6 +18,8 @@ from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.synthetic.textures import Split
 from sceneexpander.synthetic.views import SyntheticViews, make_views
 
+PHOTO_SCALE = 2  # photos over working size, as the pipeline keeps them (`scene.detail_scale`)
+PHOTO_SUPERSAMPLE = 1.0  # colour samples per pixel side when training scenes are drawn as photos
 MIN_CONFIDENT = 200  # pixels, for the scale of a scene to be read from the confident ones alone
 
 
@@ -77,7 +79,8 @@ def training_sample(index: int, seed: int, config: GeneratorConfig, *, split: Sp
             continue
         sample = sample_of_scene(scene, inputs, conditions, generator)
         if inputs > 1 and float(torch.rand((), generator=generator)) < config.own_cameras_share:
-            return own_cameras_sample(sample, generator, DenseConfig(threads=1))
+            photos = input_photos(scene, sample, supersample=PHOTO_SUPERSAMPLE)
+            return own_cameras_sample(sample, photos, generator, DenseConfig(threads=1))
         return sample
     raise ValueError(f"sample {index} of stream {seed}: no scene in 20 attempts")
 
@@ -116,13 +119,10 @@ def sample_of_scene(
 
     A view that shares nothing with the others becomes the last input without a pose.
     """
-    order = list(range(len(scene.images)))
     posed = torch.ones(inputs, dtype=torch.bool)
-    if scene.disconnected is not None and len(order) > 1:
-        order.remove(scene.disconnected)
-        order.insert(inputs - 1, scene.disconnected)
+    if scene.disconnected is not None and len(scene.images) > 1:
         posed[inputs - 1] = inputs == 1
-    pick = torch.tensor(order)
+    pick = torch.tensor(input_order(scene, inputs))
     images, depth, valid = scene.images[pick], scene.depth[pick], scene.valid[pick]
     intrinsics = scene.intrinsics_px[pick]
     truth = scene.world_from_cam[pick]
@@ -171,9 +171,39 @@ def sample_of_scene(
     )
 
 
-def own_cameras_sample(sample: Sample, generator: torch.Generator, dense: DenseConfig) -> Sample:
+def input_photos(scene: SyntheticViews, sample: Sample, *, supersample: float) -> Float[Tensor, "view 3 tall wide"]:
+    """The input views of a sample at the size at which the pipeline looks for features: the same scene, drawn larger."""
+    height, width = scene.images.shape[-2:]
+    photos = make_views(
+        scene.seed,
+        views=len(scene.images),
+        height=height * PHOTO_SCALE,
+        width=width * PHOTO_SCALE,
+        supersample=supersample,
+        split=scene.split,
+    )
+    return photos.images[torch.tensor(input_order(scene, sample.inputs)[: sample.inputs])]
+
+
+def input_order(scene: SyntheticViews, inputs: int) -> list[int]:
+    """Which view of a scene is which of a sample: a view that shares nothing with the others becomes the last input."""
+    order = list(range(len(scene.images)))
+    if scene.disconnected is not None and len(order) > 1:
+        order.remove(scene.disconnected)
+        order.insert(inputs - 1, scene.disconnected)
+    return order
+
+
+def own_cameras_sample(
+    sample: Sample,
+    photos: Float[Tensor, "view 3 tall wide"],
+    generator: torch.Generator,
+    dense: DenseConfig,
+) -> Sample:
     """The sample with the cameras (focal unknown) and the base of the whole geometric front-end; truth in their scale."""
-    priors, _ = build_priors(sample.input_images, FrontendConfig(dense=dense), generator=generator)
+    priors, _ = build_priors(
+        sample.input_images, FrontendConfig(dense=dense), generator=generator, feature_images=photos
+    )
     poses, intrinsics, depth, evidence, posed = (
         priors.world_from_cam,
         priors.intrinsics_px,

@@ -14,7 +14,13 @@ from torch import Tensor
 from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.models.mini.model import Mini
-from sceneexpander.models.mini.training.generate import Conditions, own_cameras_sample, sample_of_scene
+from sceneexpander.models.mini.training.generate import (
+    PHOTO_SUPERSAMPLE,
+    Conditions,
+    input_photos,
+    own_cameras_sample,
+    sample_of_scene,
+)
 from sceneexpander.models.mini.training.measure import geometry_row, mean_row
 from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.protocol import ALL_HEADS, Head
@@ -109,7 +115,8 @@ def scene_samples(seed: int, *, noisy: bool, front_end: bool, kept: Path | None 
         return sample_of_scene(scene_with_views(seed), INPUTS, conditions, generator, dense=dense)
 
     def own(true: Sample) -> Sample:
-        return own_cameras_sample(true, torch.Generator().manual_seed(seed), dense)
+        photos = input_photos(scene_with_views(seed), true, supersample=PHOTO_SUPERSAMPLE)
+        return own_cameras_sample(true, photos, torch.Generator().manual_seed(seed), dense)
 
     true = sample("true", lambda: simulated(TRUE_CAMERAS, 0))
     return SceneSamples(
