@@ -49,17 +49,17 @@ class DenseConfig:
 
     work_px: int = 336  # long side at which matching runs; smaller images are matched as they are
     threads: int = 2  # reference views worked on at the same time; does not change the result
-    planes: int = 64  # most depth hypotheses of the sweep
+    planes: int = 96  # most depth hypotheses of the sweep
     plane_step_px: float = 0.75  # fewer planes are used where this step in the widest source needs fewer
     far_factor: float = 0.6  # farthest plane: this over the 98th percentile of sparse depth
-    near_factor: float = 1.5  # nearest plane: this over the 2nd percentile
+    near_factor: float = 4.0  # nearest plane: this over the 2nd percentile; what is near often has no point
     sources: int = 4  # other views matched against each view, at most
     min_parallax_px: float = 0.25  # sources with less motion per 10 % of depth are not used
     window: int = 7  # side of the correlation window
     prior: float = 0.15  # most that a plane pays for contradicting the sparse interpolation
     prior_range: float = 0.7  # log-depth distance at which it pays that
     penalty_near: float = 0.04  # semi-global matching: one hypothesis further
-    penalty_jump: float = 0.35  # more than one further, on an even surface
+    penalty_jump: float = 0.5  # more than one further, on an even surface
     jump_contrast: float = 12.0  # lowers the jump penalty across grey-level edges
     ambiguity_margin: float = 0.6  # aggregated cost within which another plane counts as nearly as good
     refine_window: int = 5  # window of the refinement, which follows the surface and can be smaller
@@ -75,13 +75,16 @@ class DenseConfig:
     plane_tolerance: float = 0.1  # relative error at which a sample stops supporting a segment's plane
     min_plane_support: float = 0.6  # planes with less support are not used
     plane_weights: tuple[float, ...] = (0.1, 0.04)  # weight of a fully supported plane in the final fill, per scale
-    smooth_reach: float = 0.054  # reach of the final fill as a share of the long side
+    smooth_reach: float = 0.035  # reach of the final fill as a share of the long side
     stiffness: float = 4.0  # smoothness of the final fill against weights of 1
     colour_sigma: float = 0.04  # colour step that stops the final fill
     weight_agreed: float = 1.0  # checked, two or more other views agree
     weight_checked: float = 0.6  # checked, one other view agrees
     weight_raw: float = 0.001  # matched but not checked
-    weight_point: float = 30.0  # sparse points: one speaks for the plain area around it, too
+    weight_points: float = (
+        3000.0  # of all sparse points of a view together: many stand close and speak for little around them
+    )
+    weight_point: float = 60.0  # most of a single one: it speaks for the plain area around it, too
     point_conflict: float = 0.1  # sparse points this far (log depth) from checked pixels around them are dropped
     weight_interpolation: float = 0.003  # interpolation of the sparse points
 
@@ -303,8 +306,9 @@ def _fill_view(
     known_value = value.copy()
     row, column, log_inverse = _credible_points(view, checked, value, config.point_conflict)
     if len(row):
-        known_value[row, column], known[row, column] = log_inverse, config.weight_point
-        value, weight = _blend(value, weight, *_spread_points(row, column, log_inverse, config.weight_point, shape))
+        of_point = min(config.weight_point, config.weight_points / len(row))
+        known_value[row, column], known[row, column] = log_inverse, of_point
+        value, weight = _blend(value, weight, *_spread_points(row, column, log_inverse, of_point, shape))
     score = np.zeros(shape, np.float32)
     if known.any():
         min_size = max(4, round(config.min_segment_px * area))
