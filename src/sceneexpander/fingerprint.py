@@ -1,7 +1,8 @@
 """What code a program really consists of, as one hash that comments, docstrings and layout do not change.
 
 The hash of an entry file covers the syntax trees of every first-party module it can import (transitively, function-level imports
-included) and the bytes of the data files that lie beside them: shipped weights, page templates, kernel sources.
+included) and the bytes of the data files that lie beside them: shipped weights, page templates, kernel sources. Texts about them do not
+count.
 """
 
 from __future__ import annotations

@@ -43,6 +43,7 @@ def test_closure_follows_function_level_and_relative_imports(tree: SourceTree) -
         ("pkg/b.py", 'def g():\n    """What g does."""\n    from .room.c import VALUE  # why\n\n    return VALUE\n'),
         ("pkg/unused.py", "import sys\n"),
         ("pkg/other/data.txt", "y"),
+        ("pkg/room/weights/CARD.md", "text about what counts"),
     ],
 )
 def test_what_means_the_same_or_is_not_used_changes_nothing(tree: SourceTree, name: str, text: str) -> None:
