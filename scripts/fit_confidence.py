@@ -16,7 +16,7 @@ from rich.progress import track
 from sceneexpander.errors import UserError, entry_point
 from sceneexpander.frontend.confidence import FEATURES, RIGHT
 from sceneexpander.frontend.confidence import __file__ as module_file
-from sceneexpander.models.mini.training.buffer import sample_path
+from sceneexpander.models.mini.training.buffer import sample_path, samples_folder
 from sceneexpander.models.mini.training.confidence import calibration, fit_confidence, pixels_of_sample
 from sceneexpander.models.mini.training.generate import GeneratorConfig, training_sample
 from sceneexpander.models.mini.training.sample import Sample
@@ -39,8 +39,7 @@ def parse_arguments() -> argparse.Namespace:
 
 def collect(folder: Path, scenes: int, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """(features, log errors) of the scenes with at least two posed views; missing ones are made."""
-    folder.mkdir(parents=True, exist_ok=True)
-    stored = sorted(folder.glob("*.safetensors"))[:scenes]
+    stored = sorted(samples_folder(folder).glob("*.safetensors"))[:scenes]
     for index in track(range(len(stored), scenes), description="scenes"):
         path = sample_path(folder, index)
         training_sample(index, seed, GeneratorConfig()).save(path)

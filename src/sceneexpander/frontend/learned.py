@@ -99,7 +99,7 @@ def match_learned(a: LearnedKeypoints, b: LearnedKeypoints, config: SfmConfig) -
 
 
 def shared_descriptors(a: LearnedKeypoints, b: LearnedKeypoints) -> int:
-    """Mutual nearest neighbours among similar descriptors: a hint, a hundred times cheaper than a match, of what is worth matching."""
+    """Mutual nearest neighbours among similar descriptors: a hint, twenty times cheaper than a match, of what is worth matching."""
     if min(len(a.keypoints), len(b.keypoints)) == 0:
         return 0
     scores = a.descriptors @ b.descriptors.T

@@ -14,7 +14,7 @@ from sceneexpander.frontend.sfm import Judge, estimate_cameras
 from sceneexpander.frontend.sfm_types import SfmConfig, SparseReconstruction
 from sceneexpander.geometry.priors import Priors
 
-_JUDGE_PX = 240  # long side at which camera models are compared; half the time of the full size and the same verdicts
+_JUDGE_PX = 240  # long side at which camera models are compared; half the pixels of the full size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -44,7 +44,7 @@ class SfmConfig:
 
     learned: LearnedUse = LearnedUse.CHOOSE
     choose_most_views: int = (
-        8  # more views than this are not chosen among: wrong models of many views are rare, and dear
+        8  # more views than this are not chosen among: three models of them are dear to make and judge
     )
     learned_features: int = 2048  # per view
     learned_long_side_px: int = 1024

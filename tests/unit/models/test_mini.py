@@ -20,6 +20,7 @@ from sceneexpander.models.mini.inputs import working_size
 from sceneexpander.models.mini.pairs import PairGeometry, splat_log_depth
 from sceneexpander.models.mini.splats import covered_by_others
 from sceneexpander.models.mini.training.augment import augment, mirrored
+from sceneexpander.models.mini.training.buffer import samples_folder
 from sceneexpander.models.mini.training.generate import (
     Conditions,
     GeneratorConfig,
@@ -538,3 +539,13 @@ def test_training_lowers_the_loss_and_resumes_exactly(held_out: list[Sample], tm
     for name, value in unbroken.model.state_dict().items():
         assert torch.equal(value, second.model.state_dict()[name]), name
         assert torch.equal(unbroken.ema[name], second.ema[name]), name
+
+
+def test_broken_samples_and_folders_are_named(tmp_path: Path) -> None:
+    broken = tmp_path / "00000001.safetensors"
+    broken.write_bytes(b"junk")
+    with pytest.raises(UserError, match=r"00000001.*cannot be read as a sample"):
+        Sample.load(broken)
+    with pytest.raises(UserError, match=r"00000001.*no folder for samples"):
+        samples_folder(broken)
+    assert samples_folder(tmp_path / "new" / "one").is_dir()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from sceneexpander.errors import UserError
 from sceneexpander.models.mini.training.generate import GeneratorConfig, training_sample
 from sceneexpander.models.mini.training.sample import Sample
 
@@ -18,6 +19,17 @@ _LOG = logging.getLogger(__name__)
 def sample_path(folder: Path, index: int) -> Path:
     """Where sample number ``index`` lies."""
     return folder / f"{index:08d}.safetensors"
+
+
+def samples_folder(path: Path) -> Path:
+    """The folder, made where it is missing. Raises `UserError` where that cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"is no folder for samples: {error.strerror}", where=str(path), fix="name another one"
+        ) from error
+    return path
 
 
 def stored_indices(folder: Path) -> list[int]:

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
+from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.geometry.rigid import rigid_inverse
@@ -151,13 +152,18 @@ class Sample:
         """Read what `save` wrote.
 
         Raises:
-            ValueError: the file is not a sample of this version.
+            UserError: the file is not a sample of this version.
         """
-        with safe_open(path, framework="pt") as file:
-            facts = json.loads((file.metadata() or {}).get("sample", "{}"))
-            if facts.pop("schema", None) != _SCHEMA:
-                raise ValueError(f"{path} is not a {_SCHEMA} file")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        try:
+            with safe_open(path, framework="pt") as file:
+                facts = json.loads((file.metadata() or {}).get("sample", "{}"))
+                if facts.pop("schema", None) != _SCHEMA:
+                    raise UserError(f"is not a {_SCHEMA} file", where=str(path), fix="delete it; it is made again")
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        except (OSError, SafetensorError) as error:
+            raise UserError(
+                f"cannot be read as a sample: {error}", where=str(path), fix="delete it; it is made again"
+            ) from error
         tensors["images"] = tensors["images"].float() / 255
         normals = tensors["normals"].float() / 127
         tensors["normals"] = normals / normals.norm(dim=-1, keepdim=True).clamp(min=1e-6)

@@ -14,6 +14,7 @@ from torch import Tensor
 from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.models.mini.model import Mini
+from sceneexpander.models.mini.training.buffer import samples_folder
 from sceneexpander.models.mini.training.generate import (
     PHOTO_SUPERSAMPLE,
     Conditions,
@@ -99,7 +100,7 @@ def scene_samples(seed: int, *, noisy: bool, front_end: bool, kept: Path | None 
         kept: folder in which samples lie that were made before, and where new ones are left.
     """
     if kept is not None:
-        kept.mkdir(parents=True, exist_ok=True)
+        samples_folder(kept)
     dense = DenseConfig(threads=torch.get_num_threads())
 
     def sample(condition: str, make: Callable[[], Sample]) -> Sample:
