@@ -10,6 +10,7 @@ import torch
 
 from sceneexpander.errors import UserError
 from sceneexpander.frontend.dense import DenseConfig
+from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.camera import project_points
 from sceneexpander.geometry.gauge import priors_relative_to
 from sceneexpander.geometry.normals import normals_from_depth
@@ -450,7 +451,9 @@ def test_truth_takes_the_scale_of_the_base(held_out: list[Sample]) -> None:
 def test_own_cameras_are_those_of_the_front_end_and_truth_stays_true(held_out: list[Sample]) -> None:
     sample = held_out[0]
     photos = torch.nn.functional.interpolate(sample.input_images, scale_factor=2, mode="bilinear", antialias=True)
-    own = own_cameras_sample(sample, photos, torch.Generator().manual_seed(0), DenseConfig(threads=1))
+    own = own_cameras_sample(
+        sample, photos, torch.Generator().manual_seed(0), FrontendConfig(dense=DenseConfig(threads=1))
+    )
     assert own.wrong_focal
     assert torch.equal(own.images, sample.images)
     assert not torch.equal(own.prior_intrinsics_px, sample.prior_intrinsics_px)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig
+from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.models.mini.model import Mini
 from sceneexpander.models.mini.training.buffer import samples_folder
@@ -117,7 +118,7 @@ def scene_samples(seed: int, *, noisy: bool, front_end: bool, kept: Path | None 
 
     def own(true: Sample) -> Sample:
         photos = input_photos(scene_with_views(seed), true, supersample=PHOTO_SUPERSAMPLE)
-        return own_cameras_sample(true, photos, torch.Generator().manual_seed(seed), dense)
+        return own_cameras_sample(true, photos, torch.Generator().manual_seed(seed), FrontendConfig(dense=dense))
 
     true = sample("true", lambda: simulated(TRUE_CAMERAS, 0))
     return SceneSamples(
