@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "estimate_cameras"]
 
+_SURE_OF_A_TURN = 50  # matches of descriptors that one rotation explains, for learned ones to have no say in it
 _MIN_COMMON = 8  # points two views must share before their matches are worth finding again
 
 _log = logging.getLogger(__name__)
@@ -200,10 +201,11 @@ class _Model:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Learned:
-    """Matches of learned keypoints per pair of views, and whether they rule over those of the descriptors."""
+    """Matches of learned keypoints per pair of views, whether they rule over those of the descriptors, and what those know."""
 
     matches: dict[tuple[int, int], Matches]
     lead: bool
+    turns: frozenset[tuple[int, int]]  # pairs that many matches of descriptors show to be pure rotations
 
 
 def _model(
@@ -230,7 +232,7 @@ def _model(
         for a in range(views)
         for b in range(a + 1, views)
     ]
-    found = _pair_kinds(features, pairs, focal, config, setup)
+    found = _pair_kinds(features, pairs, focal, config, setup, frozenset() if learned is None else learned.turns)
     mapping, source = _map(build_tracks(features, pairs), features, pairs, found, known, focal, config, setup)
     return _Model(features=features, pairs=pairs, kinds=found.kinds, mapping=mapping, focal_source=source)
 
@@ -254,7 +256,15 @@ def _learned_models(
     matches = learned.match_pairs(keypoints, _pairs_worth_matching(model, keypoints, config), config)
     if not any(found.count for found in matches.values()):
         return []
-    return [_model(features, _Learned(matches=matches, lead=lead), known, focal, config, setup) for lead in leading]
+    turns = frozenset(
+        (pair.view_a, pair.view_b)
+        for pair, kind in zip(model.pairs, model.kinds, strict=True)
+        if kind is PairKind.ROTATION and pair.verified.count >= _SURE_OF_A_TURN
+    )
+    return [
+        _model(features, _Learned(matches=matches, lead=lead, turns=turns), known, focal, config, setup)
+        for lead in leading
+    ]
 
 
 def _pairs_worth_matching(model: _Model, keypoints: list[LearnedKeypoints], config: SfmConfig) -> list[tuple[int, int]]:
@@ -284,12 +294,18 @@ class _PairKinds:
 
 
 def _pair_kinds(
-    features: list[Features], pairs: list[PairMatches], focal: FocalPlan, config: SfmConfig, setup: Setup
+    features: list[Features],
+    pairs: list[PairMatches],
+    focal: FocalPlan,
+    config: SfmConfig,
+    setup: Setup,
+    turns: frozenset[tuple[int, int]],
 ) -> _PairKinds:
     """Which pairs have parallax.
 
     A wrong focal bends a wide turn so much that it looks like parallax, so where the focal is unknown the one that turns the pair's
     homography into a rotation is asked, too. It has to explain more of the matches: a free focal can hide a little parallax.
+    ``turns`` are rotations already: learned keypoints are less exact than SIFT's, and their noise looks like parallax, too.
     """
     kinds, factors = [], []
     rng = np.random.default_rng(setup.seed)
@@ -322,6 +338,9 @@ def _pair_kinds(
             found = rotation_focal(xy_a, xy_b, focal.nominal[a], bounds, threshold_px=threshold, seed=setup.seed)
             if found is not None and share(pair, found) >= config.rotation_share_free_focal:
                 factor, rotation_only = found, True
+            elif (a, b) in turns and found is not None:
+                factor = found
+        rotation_only |= (a, b) in turns
         kinds.append(PairKind.ROTATION if rotation_only else PairKind.PARALLAX)
         if rotation_only:
             factors.append(factor)
