@@ -70,14 +70,14 @@ class DenseConfig:
     max_cost: float = 0.6  # a checked pixel must match better than this
     min_part_px: int = 20  # smaller checked or confident islands are dropped (at 320 pixels; scaled by area)
     min_confidence: float = 0.6  # probability of being within 5 % from which a pixel counts as confident
-    segment_tolerances: tuple[float, ...] = (0.8, 2.0)  # colour segments, fine and coarse
+    segment_tolerances: tuple[float, ...] = (0.8, 2.0, 4.0)  # colour segments, fine to coarse
     min_segment_px: int = 40  # smallest segment (at 320 pixels; scaled by area)
     plane_tolerance: float = 0.1  # relative error at which a sample stops supporting a segment's plane
     min_plane_support: float = 0.6  # planes with less support are not used
-    plane_weights: tuple[float, ...] = (0.1, 0.04)  # weight of a fully supported plane in the final fill, per scale
+    plane_weights: tuple[float, ...] = (0.2, 0.1, 0.04)  # weight of a fully supported plane in the final fill, per scale
     smooth_reach: float = 0.035  # reach of the final fill as a share of the long side
     stiffness: float = 4.0  # smoothness of the final fill against weights of 1
-    colour_sigma: float = 0.04  # colour step that stops the final fill
+    colour_sigma: float = 0.025  # colour step that stops the final fill
     weight_agreed: float = 1.0  # checked, two or more other views agree
     weight_checked: float = 0.6  # checked, one other view agrees
     weight_raw: float = 0.001  # matched but not checked
@@ -86,7 +86,7 @@ class DenseConfig:
     )
     weight_point: float = 60.0  # most of a single one: it speaks for the plain area around it, too
     point_conflict: float = 0.1  # sparse points this far (log depth) from checked pixels around them are dropped
-    weight_interpolation: float = 0.003  # interpolation of the sparse points
+    weight_interpolation: float = 0.0015  # interpolation of the sparse points
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
