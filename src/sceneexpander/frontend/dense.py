@@ -74,7 +74,11 @@ class DenseConfig:
     min_segment_px: int = 40  # smallest segment (at 320 pixels; scaled by area)
     plane_tolerance: float = 0.1  # relative error at which a sample stops supporting a segment's plane
     min_plane_support: float = 0.6  # planes with less support are not used
-    plane_weights: tuple[float, ...] = (0.2, 0.1, 0.04)  # weight of a fully supported plane in the final fill, per scale
+    plane_weights: tuple[float, ...] = (
+        0.2,
+        0.1,
+        0.04,
+    )  # weight of a fully supported plane in the final fill, per scale
     smooth_reach: float = 0.035  # reach of the final fill as a share of the long side
     stiffness: float = 4.0  # smoothness of the final fill against weights of 1
     colour_sigma: float = 0.025  # colour step that stops the final fill
