@@ -193,11 +193,11 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--posed", type=Path)
     parser.add_argument("--photos", type=Path, nargs="*", default=[])
-    parser.add_argument("--no-retrack", action="store_true", help="cameras of the keypoints, for comparison")
+    parser.add_argument("--retrack", action="store_true", help="measure tracks again in the pictures")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    config = SfmConfig(retrack=not arguments.no_retrack)
+    config = SfmConfig(retrack=arguments.retrack)
     rows: list[Row] = []
     summaries: dict[str, dict[str, float]] = {}
 

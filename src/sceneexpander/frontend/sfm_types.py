@@ -55,7 +55,9 @@ class SfmConfig:
     )
     learned_neighbours: int = 4  # of each view that SIFT has connected: the others it is matched with
 
-    retrack: bool = True  # measure tracks again in the pictures through the depth of the first cameras
+    retrack: bool = (
+        False  # measure tracks again in the pictures through the depth of the first cameras (docs/decisions.md)
+    )
     retrack_most_views: int = 16  # its cost grows with the square of the views
     retrack_points: int = 700  # corners per view
     min_retracked: int = 30  # observations that a view must keep, or its keypoints are used as well

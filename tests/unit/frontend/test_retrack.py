@@ -118,7 +118,7 @@ def test_too_few_corners_leave_the_cameras_as_they_were(scene: scenes.Scene) -> 
     config = replace(CONFIG, retrack_points=4)
     starved = estimate_cameras(
         scene.images,
-        replace(config, min_retracked=0),
+        replace(config, retrack=True, min_retracked=0),
         generator=torch.Generator().manual_seed(0),
         pictures=Depth(scene),
     )
