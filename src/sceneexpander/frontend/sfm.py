@@ -3,7 +3,7 @@
 Features -> mutual matches -> verified pairs -> tracks; then, for several plausible focals, an initial pair chosen by inliers
 x triangulation angle, PnP registration, triangulation and bundle adjustment; the focal that explains the matches best is kept
 and refined where there is enough evidence. Where the caller can say what the pictures think of cameras, several models compete
-and the winner's tracks are measured again in the pictures. Every view comes out with a pose; those without evidence are marked.
+and the winner's tracks can be measured again in the pictures. Every view comes out with a pose; those without evidence are marked.
 """
 
 from __future__ import annotations
