@@ -28,7 +28,7 @@ from PIL import Image
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig
-from sceneexpander.frontend.prior import DensePictures
+from sceneexpander.frontend.prior import picture_judge
 from sceneexpander.frontend.sfm import SfmConfig, SparseReconstruction, estimate_cameras
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.synthetic import make_views
@@ -73,8 +73,8 @@ def measure(
 ) -> Row:
     """Estimate the cameras of one set and compare them with the truth where there is one."""
     start = time.process_time()
-    pictures = DensePictures(images, DenseConfig(threads=1))
-    found = estimate_cameras(images, config, generator=torch.Generator().manual_seed(0), pictures=pictures)
+    judge = picture_judge(images, DenseConfig(threads=1))
+    found = estimate_cameras(images, config, generator=torch.Generator().manual_seed(0), judge=judge)
     spent = time.process_time() - start
     rotation, translation = ((), ()) if truth is None else pair_errors(found, truth)
     report = found.report
@@ -193,11 +193,10 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--posed", type=Path)
     parser.add_argument("--photos", type=Path, nargs="*", default=[])
-    parser.add_argument("--retrack", action="store_true", help="measure tracks again in the pictures")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    config = SfmConfig(retrack=arguments.retrack)
+    config = SfmConfig()
     rows: list[Row] = []
     summaries: dict[str, dict[str, float]] = {}
 

@@ -39,8 +39,8 @@ def check_view(
         if other == view or other_depth is None:
             continue
         matrix, shift = relative_projection(reference, views[other])
-        there_x, there_y, there_z = transfer(matrix, shift, x, y, depth)
-        further_x, further_y, further_z = transfer(matrix, shift, x, y, depth * np.float32(1.1))
+        there_x, there_y, there_z = _transfer(matrix, shift, x, y, depth)
+        further_x, further_y, further_z = _transfer(matrix, shift, x, y, depth * np.float32(1.1))
         seen = (there_x >= 0) & (there_x < width) & (there_y >= 0) & (there_y < height)
         seen &= (there_z > 0) & (further_z > 0)
         motion = np.hypot(further_x - there_x, further_y - there_y)
@@ -49,7 +49,7 @@ def check_view(
         found = other_depth[row, column]
         back_matrix, back_shift = relative_projection(views[other], reference)
         centre_x, centre_y = column.astype(np.float32) + 0.5, row.astype(np.float32) + 0.5
-        back_x, back_y, _ = transfer(back_matrix, back_shift, centre_x, centre_y, found)
+        back_x, back_y, _ = _transfer(back_matrix, back_shift, centre_x, centre_y, found)
         # The other depth map is read at the nearest pixel centre, up to half a pixel from where the point falls.
         error = np.hypot(back_x - x, back_y - y)
         seen &= (error < reprojection_px) & (np.abs(found - there_z) < depth_tolerance * there_z)
@@ -57,7 +57,7 @@ def check_view(
     return Agreement(agreeing=agreeing, parallax=parallax)
 
 
-def transfer(
+def _transfer(
     matrix: Array64, shift: Array64, x: Image32, y: Image32, depth: Image32
 ) -> tuple[Image32, Image32, Image32]:
     """(x, y, z) in the other view of pixels at the given depths; z <= 0 means behind it (x and y are then meaningless)."""

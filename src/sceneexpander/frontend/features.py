@@ -46,11 +46,6 @@ def grey_u8(image: Float[np.ndarray, "3 height width"]) -> UInt8[np.ndarray, "he
     return np.clip(np.rint(luma * 255.0), 0, 255).astype(np.uint8)
 
 
-def equalised(grey: UInt8[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
-    """The image with its contrast evened out from place to place (CLAHE)."""
-    return cv2.createCLAHE(clipLimit=_CLAHE_CLIP, tileGridSize=(_CLAHE_TILES, _CLAHE_TILES)).apply(grey)
-
-
 def detect_features(grey: UInt8[np.ndarray, "height width"], config: SfmConfig) -> Features:
     """SIFT keypoints with RootSIFT descriptors. An image without structure gives an empty set."""
     height, width = grey.shape
@@ -58,7 +53,7 @@ def detect_features(grey: UInt8[np.ndarray, "height width"], config: SfmConfig) 
     if enlarge != 1.0:
         grey = cv2.resize(grey, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
     if config.equalise:
-        grey = equalised(grey)
+        grey = cv2.createCLAHE(clipLimit=_CLAHE_CLIP, tileGridSize=(_CLAHE_TILES, _CLAHE_TILES)).apply(grey)
     # Precise upscale: without it OpenCV's doubled first octave shifts every keypoint by a quarter of a pixel.
     sift = cv2.SIFT.create(
         nfeatures=config.max_features, contrastThreshold=config.contrast_threshold, enable_precise_upscale=True

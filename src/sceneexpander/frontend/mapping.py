@@ -234,24 +234,13 @@ class Mapping:
             self.adjust(refine_focal=refine_focal, free=free)
             self.prune(threshold_px=threshold)
         for _ in range(2):
-            robust, threshold = self._limits_px()
+            errors = self.errors_px()[self.active & self.registered] / self.unit_px
+            sigma = float(np.median(errors)) / 1.18 if len(errors) else self.config.robust_px
+            robust = float(np.clip(2 * sigma, self.config.min_robust_px, self.config.robust_px))
+            threshold = float(np.clip(8 * sigma, self.config.min_inlier_px, self.config.inlier_px))
             self.triangulate(threshold_px=threshold)
             self.adjust(refine_focal=refine_focal, free=free, robust_px=robust)
             self.prune(threshold_px=threshold)
-
-    def complete(self) -> None:
-        """Points of all tracks at the cameras as they are."""
-        for threshold in (self.config.inlier_px, None):
-            limit = self._limits_px()[1] if threshold is None else threshold
-            self.triangulate(threshold_px=limit)
-            self.prune(threshold_px=limit)
-
-    def _limits_px(self) -> tuple[float, float]:
-        """(robust scale, threshold) that suit the present errors, in pixels of the reference size."""
-        errors = self.errors_px()[self.active & self.registered] / self.unit_px
-        sigma = float(np.median(errors)) / 1.18 if len(errors) else self.config.robust_px
-        robust = float(np.clip(2 * sigma, self.config.min_robust_px, self.config.robust_px))
-        return robust, float(np.clip(8 * sigma, self.config.min_inlier_px, self.config.inlier_px))
 
     # --- adjusting ---------------------------------------------------------------------------------------------------
 

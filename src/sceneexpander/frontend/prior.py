@@ -10,12 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, checked_share, dense_depth
-from sceneexpander.frontend.sfm import estimate_cameras
+from sceneexpander.frontend.sfm import Judge, estimate_cameras
 from sceneexpander.frontend.sfm_types import SfmConfig, SparseReconstruction
-from sceneexpander.frontend.sparse_points import SparsePoints
 from sceneexpander.geometry.priors import Priors
 
-_ROUGH_PX = 240  # long side at which camera models are compared and improved; half the pixels of the full size
+_JUDGE_PX = 240  # long side at which camera models are compared; half the pixels of the full size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +49,7 @@ def build_priors(
         known_world_from_cam=known_world_from_cam,
         focal_hint_px=focal_hint_px,
         names=names,
-        pictures=DensePictures(images, config.dense),
+        judge=picture_judge(images, config.dense),
     )
     dense = dense_depth(
         images.cpu(),
@@ -72,23 +71,24 @@ def build_priors(
     return priors, sparse
 
 
-class DensePictures:
-    """Looks at pictures through cameras by dense matching at a reduced size (`sfm_types.Pictures`)."""
+def picture_judge(images: Float[Tensor, "view 3 height width"], dense: DenseConfig) -> Judge:
+    """Says of cameras which share of the pictures they explain: pixels that match another view and lead back.
 
-    def __init__(self, images: Float[Tensor, "view 3 height width"], dense: DenseConfig) -> None:
-        self._images = images.detach().cpu()
-        self._rough = replace(dense, work_px=min(dense.work_px, _ROUGH_PX))
+    A camera model is made of its own matches and explains them whatever they are; the pictures were not asked before.
+    """
+    rough = replace(dense, work_px=min(dense.work_px, _JUDGE_PX))
 
-    def explained(self, candidate: SparseReconstruction) -> float:
-        """Share of all pixels that match another view and lead back."""
-        return checked_share(*self._seen_through(candidate), self._rough, posed=candidate.posed)
+    def judge(candidate: SparseReconstruction) -> float:
+        return checked_share(
+            images.cpu(),
+            candidate.world_from_cam,
+            candidate.intrinsics_px,
+            candidate.sparse,
+            rough,
+            posed=candidate.posed,
+        )
 
-    def depth(self, candidate: SparseReconstruction) -> Float[Tensor, "view height width"]:
-        """Depth of every pixel, in the scale of the candidate."""
-        return dense_depth(*self._seen_through(candidate), self._rough, posed=candidate.posed).depth
-
-    def _seen_through(self, candidate: SparseReconstruction) -> tuple[Tensor, Tensor, Tensor, SparsePoints]:
-        return self._images, candidate.world_from_cam, candidate.intrinsics_px, candidate.sparse
+    return judge
 
 
 def rescaled(reconstruction: SparseReconstruction, scale: float) -> SparseReconstruction:

@@ -2,15 +2,15 @@
 
 Features -> mutual matches -> verified pairs -> tracks; then, for several plausible focals, an initial pair chosen by inliers
 x triangulation angle, PnP registration, triangulation and bundle adjustment; the focal that explains the matches best is kept
-and refined where there is enough evidence. Where the caller can say what the pictures think of cameras, several models compete
-and the winner's tracks can be measured again in the pictures. Every view comes out with a pose; those without evidence are marked.
+and refined where there is enough evidence. Where the caller can say what the pictures think of cameras, several models compete.
+Every view comes out with a pose; those without evidence are marked.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,6 @@ from sceneexpander.frontend.features import Features, detect_features
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.matching import Matches
 from sceneexpander.frontend.placement import place_remaining, thumbnails_of
-from sceneexpander.frontend.retrack import retrack
 from sceneexpander.frontend.sfm_report import build_reconstruction
 from sceneexpander.frontend.sfm_setup import FocalPlan, KnownCameras, Setup, known_cameras, prepare
 from sceneexpander.frontend.sfm_types import (
@@ -30,7 +29,6 @@ from sceneexpander.frontend.sfm_types import (
     LearnedUse,
     PairKind,
     PairReport,
-    Pictures,
     SfmConfig,
     SfmReport,
     SparseReconstruction,
@@ -54,6 +52,8 @@ if TYPE_CHECKING:
 __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "estimate_cameras"]
 
 _SURE_OF_A_TURN = 50  # matches of descriptors that one rotation explains, for learned ones to have no say in it
+Judge = Callable[[SparseReconstruction], float]
+
 _MIN_COMMON = 8  # points two views must share before their matches are worth finding again
 
 _log = logging.getLogger(__name__)
@@ -69,7 +69,7 @@ def estimate_cameras(
     known_world_from_cam: Float[Tensor, "view 4 4"] | None = None,
     focal_hint_px: float | None = None,
     names: Sequence[str] | None = None,
-    pictures: Pictures | None = None,
+    judge: Judge | None = None,
 ) -> SparseReconstruction:
     """Poses, intrinsics and sparse points of S >= 1 views. Never fails on hard images: see ``report`` and ``posed``.
 
@@ -84,9 +84,9 @@ def estimate_cameras(
             otherwise.
         focal_hint_px: focal of all views in pixels of ``images`` (EXIF): a strong hint, still refined.
         names: of the views, for the report.
-        pictures: looked at through cameras. For `LearnedUse.CHOOSE`: among the candidates that pose most views the one that
-            explains most of them is taken; repeated windows, stripes and tiles give models that explain their own matches well
-            and the pictures badly. For ``config.retrack``: the depth in which tracks are measured again.
+        judge: says how well a candidate fits the pictures (higher is better), for `LearnedUse.CHOOSE`: among the candidates that
+            pose most views the best one is taken. Repeated windows, stripes and tiles give models that explain their own
+            matches well and the pictures badly.
 
     Raises:
         UserError: known cameras that are no cameras.
@@ -96,73 +96,21 @@ def estimate_cameras(
     known = known_cameras(setup, known_intrinsics_px, known_world_from_cam)
     focal = FocalPlan.make(config, setup, known, focal_hint_px)
     model = _model([detect_features(grey, config) for grey in setup.greys], None, known, focal, config, setup)
-    model, found = _best_model(model, known, focal, config, setup, pictures)
-    again = config.retrack and len(setup.greys) <= config.retrack_most_views and not known.posed.all()
-    if pictures is None or not again or model.mapping.registered.sum() < 2:
-        return found
-    depth = pictures.depth(found).numpy() / found.report.scale
-    better = _retracked(model, depth, known, focal, config, setup)
-    return found if better is None else _reconstruction(better, config, setup)
-
-
-def _best_model(
-    model: _Model,
-    known: KnownCameras,
-    focal: FocalPlan,
-    config: SfmConfig,
-    setup: Setup,
-    pictures: Pictures | None,
-) -> tuple[_Model, SparseReconstruction]:
-    """The model made of descriptors alone, or one with learned matches, as ``config.learned`` says."""
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
-    if choosing and pictures is not None and not known.posed.all():
+    if choosing and judge is not None and not known.posed.all():
         candidates = [model, *_learned_models(model, (False, True), known, focal, config, setup)]
         finished = [_reconstruction(candidate, config, setup) for candidate in candidates]
         if len(finished) == 1:
-            return model, finished[0]
-        verdicts = [(int(candidate.posed.sum()), pictures.explained(candidate)) for candidate in finished]
+            return finished[0]
+        verdicts = [(int(candidate.posed.sum()), judge(candidate)) for candidate in finished]
         best = max(range(len(finished)), key=lambda k: verdicts[k])
         _log.info("camera models: (views posed, share that fits) %s, number %d taken", verdicts, best)
-        return candidates[best], finished[best]
+        return finished[best]
     if config.learned is LearnedUse.ALWAYS or (config.learned is not LearnedUse.NEVER and model.left_out.any()):
         for joined in _learned_models(model, (False,), known, focal, config, setup):
             if config.learned is LearnedUse.ALWAYS or joined.left_out.sum() < model.left_out.sum():
                 model = joined
-    return model, _reconstruction(model, config, setup)
-
-
-def _retracked(
-    model: _Model, depth: np.ndarray, known: KnownCameras, focal: FocalPlan, config: SfmConfig, setup: Setup
-) -> _Model | None:
-    """The model with cameras adjusted to tracks that were measured in the pictures, or None where there are too few.
-
-    ``depth`` is in the scale of the model's mapping.
-    """
-    old = model.mapping
-    measured = retrack(
-        setup.greys,
-        old.rotations,
-        old.translations,
-        old.intrinsics,
-        depth,
-        old.registered,
-        points=config.retrack_points,
-        unit_px=setup.unit_px,
-    )
-    tracks, free = measured, _free_views(old, known, config)
-    starved = old.registered & (measured.seen.sum(0) < config.min_retracked)
-    if starved.any():
-        tracks = Tracks.joined([measured, old.tracks.of_views(starved)])
-    precise = _on_all_tracks(old, tracks, focal, config, setup)
-    attempted = _may_refine_focal(old, focal, config)
-    refined = _finish(precise, attempted, free, config)
-    if ((precise.active & precise.valid[:, None]).sum(0)[old.registered] < config.min_register_inliers).any():
-        _log.info("too few corners are found again in the pictures: the cameras of the keypoints stay")
-        return None
-    source = FocalSource.REFINED if refined else _unrefined_source(model.focal_source, attempted, focal)
-    full = _on_all_tracks(precise, Tracks.joined([measured, old.tracks]), focal, config, setup)
-    full.complete()
-    return replace(model, mapping=full, focal_source=source)
+    return _reconstruction(model, config, setup)
 
 
 def _reconstruction(model: _Model, config: SfmConfig, setup: Setup) -> SparseReconstruction:
@@ -389,24 +337,16 @@ def _map(
     best = _on_all_tracks(best, tracks, focal, config, setup)
     free = _free_views(best, known, config)
     best.grow(refine_focal=False, free=free)
-    attempted = _may_refine_focal(best, focal, config)
+    attempted = focal.refine and (focal.source is not None or int(best.registered.sum()) >= config.min_views_for_focal)
     refine = _finish(best, attempted, free, config)
     if config.guided:
         again = build_tracks(features, _guided_pairs(best, features, pairs, config))
         best = _on_all_tracks(best, again, focal, config, setup)
         best.grow(refine_focal=False, free=_free_views(best, known, config))
         refine = _finish(best, refine, free, config)
-    return best, FocalSource.REFINED if refine else _unrefined_source(FocalSource.SWEPT, attempted, focal)
-
-
-def _may_refine_focal(mapping: Mapping, focal: FocalPlan, config: SfmConfig) -> bool:
-    """Whether bundle adjustment may move the focal: it is not given as exact, and there is something to know it from."""
-    return focal.refine and (focal.source is not None or int(mapping.registered.sum()) >= config.min_views_for_focal)
-
-
-def _unrefined_source(otherwise: FocalSource, attempted: bool, focal: FocalPlan) -> FocalSource:
-    """Where a focal comes from that bundle adjustment did not settle."""
-    return focal.source or (FocalSource.ASSUMED if attempted else otherwise)
+    if refine:
+        return best, FocalSource.REFINED
+    return best, focal.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)
 
 
 def _new_mapping(tracks: Tracks, intrinsics: np.ndarray, focal: FocalPlan, config: SfmConfig, setup: Setup) -> Mapping:

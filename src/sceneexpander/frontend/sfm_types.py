@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -55,13 +54,6 @@ class SfmConfig:
     )
     learned_neighbours: int = 4  # of each view that SIFT has connected: the others it is matched with
 
-    retrack: bool = (
-        False  # measure tracks again in the pictures through the depth of the first cameras (docs/decisions.md)
-    )
-    retrack_most_views: int = 16  # its cost grows with the square of the views
-    retrack_points: int = 700  # corners per view
-    min_retracked: int = 30  # observations that a view must keep, or its keypoints are used as well
-
     # Verification of pairs.
     epipolar_px: float = 1.5  # MAGSAC noise scale for fundamental, essential and homography models
     min_pair_inliers: int = 15
@@ -110,18 +102,6 @@ class SfmConfig:
             )
         if not 0 < self.match_ratio <= self.loose_match_ratio <= 1:
             raise ValueError(f"0 < match_ratio {self.match_ratio} <= loose_match_ratio {self.loose_match_ratio} <= 1")
-
-
-class Pictures(Protocol):
-    """What the pictures say about cameras; the cameras' own matches are not asked."""
-
-    def explained(self, candidate: SparseReconstruction) -> float:
-        """Share of the pictures that the cameras explain: pixels that match another view and lead back."""
-        ...
-
-    def depth(self, candidate: SparseReconstruction) -> Float[Tensor, "view rough_height rough_width"]:
-        """Rough z-depth of every view at these cameras, in their scale."""
-        ...
 
 
 class PairKind(StrEnum):

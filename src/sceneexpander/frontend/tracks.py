@@ -24,19 +24,6 @@ class Tracks:
         """Number of tracks."""
         return int(self.seen.shape[0])
 
-    def of_views(self, views: Bool[np.ndarray, " view"]) -> Tracks:
-        """The tracks that any of these views sees."""
-        rows = (self.seen & views).any(1)
-        return Tracks(pixel_xy=self.pixel_xy[rows], seen=self.seen[rows])
-
-    @classmethod
-    def joined(cls, parts: Sequence[Tracks]) -> Tracks:
-        """All tracks of several sets over the same views, in order."""
-        return cls(
-            pixel_xy=np.concatenate([part.pixel_xy for part in parts]),
-            seen=np.concatenate([part.seen for part in parts]),
-        )
-
     def longest(self, count: int) -> Tracks:
         """The ``count`` tracks that most views see; earlier ones first among equals."""
         rows = np.sort(np.argsort(-self.seen.sum(1), kind="stable")[:count])

