@@ -31,7 +31,13 @@ from sceneexpander.models.mini.training.generate import (
     sample_of_scene,
     training_sample,
 )
-from sceneexpander.models.mini.training.losses import confidence_loss, render_loss
+from sceneexpander.models.mini.training.losses import (
+    confidence_loss,
+    depth_loss,
+    log_depth_error,
+    render_loss,
+    scale_loss,
+)
 from sceneexpander.models.mini.training.measure import geometry_row
 from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.mini.training.scores import scene_samples
@@ -112,7 +118,7 @@ def test_a_perturbed_model_changes_depth_and_cameras_but_not_the_world_frame() -
     torch.testing.assert_close(prediction.world_from_cam[0], torch.eye(4), atol=1e-6, rtol=0)
 
 
-def test_confident_pixels_move_a_tenth_as_far() -> None:
+def test_confident_pixels_move_a_tenth_as_far_unless_the_network_says_otherwise() -> None:
     images, priors = scene(2, 56, 56)
     model = make_model()
     with torch.no_grad():
@@ -124,6 +130,11 @@ def test_confident_pixels_move_a_tenth_as_far() -> None:
     expected = 2 * torch.tanh(torch.tensor(0.15))
     torch.testing.assert_close(moved[~confident], expected.expand_as(moved[~confident]), atol=1e-5, rtol=0)
     torch.testing.assert_close(moved[confident], (0.1 * expected).expand_as(moved[confident]), atol=1e-5, rtol=0)
+    with torch.no_grad():
+        model.network.depth_head[-1].bias[2] = -100  # nothing holds them
+    freed = model.predict(images, priors, heads=frozenset({Head.DEPTH})).depth
+    assert freed is not None
+    torch.testing.assert_close((freed / priors.depth).log(), expected.expand_as(moved), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("views", "height", "width"), [(1, 14, 28), (2, 70, 42), (4, 126, 84), (6, 42, 98)])
@@ -512,6 +523,26 @@ def test_confidence_loss_is_least_where_confidence_is_one_over_the_error() -> No
     valid = torch.ones(1, 2, 2, dtype=torch.bool)
     losses = [float(confidence_loss(error, torch.full((1, 2, 2), c), valid)) for c in (5.0, 10.0, 20.0)]
     assert losses[1] < min(losses[0], losses[2])
+
+
+def test_between_two_possible_depths_the_likelier_one_is_asked_for() -> None:
+    valid, confident = torch.ones(1, 1, 10, dtype=torch.bool), torch.zeros(1, 1, 10)
+    possible = torch.tensor([0.0] * 6 + [1.0] * 4)[None, None]  # logarithms
+    losses = [float(depth_loss(guess - possible, valid, confident)) for guess in (0.0, 0.5, 1.0)]
+    assert losses[0] < losses[2] < losses[1]
+
+
+def test_the_scale_of_a_view_without_a_pose_counts_apart_from_its_shape(held_out: list[Sample]) -> None:
+    sample = held_out[0]
+    lost = replace(sample, posed=torch.arange(sample.inputs) < sample.inputs - 1)
+    valid = lost.valid[: lost.inputs]
+    truth = torch.where(valid, lost.log_depth[: lost.inputs], 0.0)
+    scaled = truth.clone()
+    scaled[-1] += 0.3
+    assert float(log_depth_error(scaled, lost, valid).abs().max()) < 1e-5
+    assert float(scale_loss(scaled, lost, valid)) == pytest.approx(0.3 / lost.inputs, abs=1e-4)
+    assert float(scale_loss(truth, lost, valid)) == pytest.approx(0, abs=1e-6)
+    assert float(scale_loss(scaled, sample, valid)) == 0
 
 
 def test_render_loss_is_zero_for_equal_pictures_only() -> None:

@@ -30,7 +30,9 @@ class MiniConfig:
     camera_steps: int = 2
     camera_gain: float = 0.02  # share of the camera head's residual that is applied, see `Mini._cameras`
     max_log_residual: float = 2.0  # the depth residual saturates at e^2 = 7.4 times the base
-    confident_pull: float = 0.9  # share of the residual that confident pixels ignore
+    confident_pull: float = (
+        0.9  # share of the residual that confident pixels ignore, as long as the network does not say otherwise
+    )
     splat_std_px: float = 0.55  # standard deviation of a Gaussian in pixels of its own view
     max_stretch: float = 3.0  # along the slant of a surface, 1 / cos at most
     splat_thickness: float = 0.2  # standard deviation along the normal / across

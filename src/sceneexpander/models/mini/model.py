@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 
@@ -216,15 +217,23 @@ class Mini(nn.Module):
         return vector, world_from_cam, priors.intrinsics_px * gain
 
     def _depth(
-        self, raw: Float[Tensor, "view 2 out_height out_width"], priors: MeasuredPriors
+        self, raw: Float[Tensor, "view 3 out_height out_width"], priors: MeasuredPriors
     ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
-        """(depth, confidence): log depth = log base + (1 - pull x confident) x residual."""
+        """(depth, confidence): log depth = log base + (1 - pull x confident) x residual.
+
+        The pull is the network's to judge: under wrong cameras a base can agree with itself and be wrong everywhere.
+        """
         limit = self.config.max_log_residual
-        residual, logit = _upsample(raw, *priors.depth.shape[-2:]).unbind(1)
-        free = 1 - self.config.confident_pull * priors.confident
+        residual, logit, pull = _upsample(raw, *priors.depth.shape[-2:]).unbind(1)
+        free = 1 - torch.sigmoid(pull + _logit(self.config.confident_pull)) * priors.confident
         depth = priors.depth * (free * limit * torch.tanh(residual / limit)).exp()
         base_logit = _BASE_CONF_LOGIT[0] + _BASE_CONF_LOGIT[1] * priors.confident
         return depth, 1 + (base_logit + logit).clamp(max=10).exp()
+
+
+def _logit(share: float) -> float:
+    """The number whose sigmoid is ``share``."""
+    return math.log(share / (1 - share))
 
 
 def _upsample(maps: Float[Tensor, "view channel rows columns"], height: int, width: int) -> Tensor:

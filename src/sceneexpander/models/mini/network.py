@@ -81,7 +81,8 @@ class MiniNetwork(nn.Module):
         self.skip_half = nn.Conv2d(half, config.features // 2, 1)
         self.skip_quarter = nn.Conv2d(quarter, config.features, 1)
         self.skip_eighth = nn.Conv2d(eighth, config.features, 1)
-        self.depth_head = _dense_head(config, 2)  # log depth residual, confidence logit
+        # Log depth residual, confidence logit, and a logit of how far confident pixels keep to the base.
+        self.depth_head = _dense_head(config, 3)
         self.normals_head = _dense_head(config, 4)  # normal residual, confidence logit
         self.gaussian_head = _dense_head(config, SPLAT_RESIDUALS)
         for head in (self.depth_head, self.normals_head, self.gaussian_head):

@@ -30,9 +30,9 @@ class GeneratorConfig:
 
     # Height, width. The working sizes of the front-end, for the base of a smaller picture is another base.
     sizes: tuple[tuple[int, int], ...] = ((280, 336), (280, 336), (336, 280), (252, 336), (224, 336), (168, 224))
-    view_shares: tuple[float, ...] = (0.03, 0.2, 0.27, 0.33, 0.1, 0.07)  # of 1, 2, ... input views
+    view_shares: tuple[float, ...] = (0.02, 0.13, 0.25, 0.45, 0.1, 0.05)  # of 1, 2, ... input views
     held_out_views: int = 1
-    own_cameras_share: float = 0.5  # of the samples of several views: the whole front-end, focal unknown
+    own_cameras_share: float = 0.75  # of the samples of several views: the whole front-end, focal unknown
     # Matches of the front-end there: SIFT's alone take a third of the time of the default, and fail in the same ways.
     own_cameras_learned: LearnedUse = LearnedUse.NEVER
     exact_pose_share: float = 0.35

@@ -12,6 +12,7 @@ from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.protocol import Prediction
 
 FARTHEST = 12.0  # pixels beyond this multiple of the scene's median depth carry no depth loss
+_NEAR, _NEAR_WEIGHT = 0.2, 0.5  # of the saturating term: it weighs as much as |log error| up to about this error
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 
 
@@ -47,8 +48,25 @@ def depth_loss(
     valid: Bool[Tensor, "view height width"],
     confident: Float[Tensor, "view height width"],
 ) -> Float[Tensor, ""]:
-    """Mean |log error|; pixels that the base is not confident of weigh twice."""
-    return masked_mean(error.abs(), valid * (2 - confident))
+    """Mean |log error| and a term that saturates; pixels that the base is not confident of weigh twice.
+
+    Where the pictures leave several depths possible, |log error| alone asks for one in between, which is none of them.
+    """
+    size = error.abs()
+    return masked_mean(size + _NEAR_WEIGHT * (1 - (-size / _NEAR).exp()), valid * (2 - confident))
+
+
+def scale_loss(
+    log_depth: Float[Tensor, "view height width"], sample: Sample, valid: Bool[Tensor, "view height width"]
+) -> Float[Tensor, ""]:
+    """Mean |mean log error| over the views without a pose: their scale, which `log_depth_error` leaves free.
+
+    It is a guess from what pictures of such places are like, so it must not be paid for with their shape.
+    """
+    lost = torch.nonzero(~sample.posed)[:, 0].tolist()
+    truth = torch.where(valid, sample.log_depth[: sample.inputs], 0.0)
+    errors = [masked_mean(log_depth[view] - truth[view], valid[view]).abs() for view in lost]
+    return torch.stack(errors).sum() / sample.inputs if errors else log_depth.new_zeros(())
 
 
 def confidence_loss(

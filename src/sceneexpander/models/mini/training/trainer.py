@@ -29,6 +29,7 @@ from sceneexpander.models.mini.training.losses import (
     log_depth_error,
     normal_losses,
     render_loss,
+    scale_loss,
     supervised_pixels,
 )
 from sceneexpander.models.mini.training.measure import geometry_row, mean_row
@@ -46,6 +47,7 @@ class LossWeights:
     """What each term counts."""
 
     depth: float = 1.0
+    scale: float = 0.3  # of views without a pose
     confidence: float = 0.05
     gradient: float = 0.5
     normals: float = 1.0
@@ -92,6 +94,7 @@ def sample_losses(
     normals, normals_confidence = normal_losses(prediction.normals, prediction.normals_conf, sample)
     terms = {
         "depth": weights.depth * depth_loss(error, valid, confident),
+        "scale": weights.scale * scale_loss(prediction.depth.log(), sample, valid),
         "confidence": weights.confidence * confidence_loss(error, prediction.depth_conf, valid),
         "gradient": weights.gradient * gradient_loss(error, valid),
         "normals": weights.normals * normals,
