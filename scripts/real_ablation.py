@@ -19,6 +19,7 @@ from sceneexpander.artifacts.views import ViewSet, save_png
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.errors import entry_point
 from sceneexpander.evaluation import EvaluateConfig, evaluate
 from sceneexpander.expansion import (
     RoundInputs,
@@ -92,6 +93,7 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
         save_png(out / f"{scene.name}-photos.png", torch.cat(list(views.images), dim=-1))
 
 
+@entry_point
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)

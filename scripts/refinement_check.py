@@ -18,6 +18,7 @@ from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.errors import entry_point
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.expansion import initial_state
 from sceneexpander.expansion.loaded import load_model
@@ -67,6 +68,7 @@ def held_out(
     return shown(without, views, view), shown(fitted, views, view)
 
 
+@entry_point
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)

@@ -17,6 +17,7 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from sceneexpander.errors import entry_point
 from sceneexpander.models.mini import Mini, MiniConfig
 from sceneexpander.models.mini.training.buffer import fill_buffer, sample_path, stored_indices
 from sceneexpander.models.mini.training.generate import GeneratorConfig, training_sample
@@ -134,6 +135,7 @@ def export(config: DictConfig) -> None:
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="train_mini")
+@entry_point
 def main(config: DictConfig) -> None:
     """Entry point."""
     torch.set_num_threads(1)
