@@ -1,7 +1,7 @@
 """Recompute the quality bars of the shipped `mini` on held-out scenes: `python scripts/mini_scores.py [--scenes 200]`.
 
-Writes outputs/mini_scores.json, one row per bar with its value, the baselines and the demand. The default takes about four
-minutes on two cores; the whole set is 200 scenes. With --samples, what the front-end makes of the scenes is kept, so that other
+Writes outputs/mini_scores.json, one row per bar with its value, the baselines and the demand. The default takes two and
+a half minutes on one core; the whole set is 200 scenes. With --samples, what the front-end makes of the scenes is kept, so that other
 weights are compared on the same scenes in a fraction of the time.
 """
 
