@@ -29,7 +29,14 @@ from sceneexpander.fingerprint import SourceTree
 from sceneexpander.project import find_project
 
 TABLE = ("anchor", "subset_aug", "self_distill", "self_distill_p1", "full")  # the paper's, after the baseline
-BEYOND = ("no_realign", "no_tone", "no_trust", "none", "splat")  # "none": nothing left out of the default
+BEYOND = (
+    "no_realign",
+    "no_tone",
+    "no_trust",
+    "no_close_gaps",
+    "none",
+    "splat",
+)  # "none": nothing left out of the default
 CONTROLS = ("control_no_adaptation", "control_no_insertion", "control_no_anchor")
 GRADES_BY_DEFAULT = ("mixed_2",)
 SCHEMA = "ablation/1"

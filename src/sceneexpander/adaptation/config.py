@@ -159,7 +159,7 @@ class AdaptConfig:
     drift: DriftForm = DriftForm.SUM
     gauge: Gauge = Gauge.KEEP_FIRST
     subset: SubsetRule = SubsetRule.PAPER
-    # Beyond the paper: see the modules gaussian_head, consistency and realign.
+    # Beyond the paper: see the modules gaussian_head, consistency, gaps, realign and tone.
     splat_steps: int = 0  # steps of the Gaussian head alone on the captured photos, after Algorithm 1; 0: none
     splat_learning_rate: float = 3e-3
     splat_others: float = 0.5  # weight of the same photos without the view's own Gaussians
@@ -167,6 +167,9 @@ class AdaptConfig:
     realign: Realign = Realign.NONE
     tone: bool = False  # bring the inserted picture to the photos' exposure and white balance, see `sceneexpander.adaptation.tone`
     trust: bool = False  # generated Gaussians fade where captured views contradict them, see `consistency.trusted`
+    close_gaps: float = (
+        0.0  # reach of generated Gaussians of new space, in distances between neighbours, see `gaps.closed`; 0: as made
+    )
     warp_targets: bool = False  # move the anchors of a warped view with its pixels
     precision: Precision = Precision.FP32
     checkpoint_every: int = 25  # steps between resume points; 0: none
@@ -190,6 +193,7 @@ class AdaptConfig:
             (self.camera_huber > 0, f"camera_huber must be > 0, is {self.camera_huber}"),
             (self.splat_steps >= 0, f"splat_steps must be >= 0, is {self.splat_steps}"),
             (self.splat_learning_rate > 0, f"splat_learning_rate must be > 0, is {self.splat_learning_rate}"),
+            (self.close_gaps >= 0, f"close_gaps must be >= 0, is {self.close_gaps}"),
             (self.splat_others >= 0, f"splat_others must be >= 0, is {self.splat_others}"),
         ]
         for fine, message in problems:

@@ -121,7 +121,7 @@ def trust_factors(
     agrees = _agrees(
         gaussians.means[made], rgb_from_sh(gaussians.sh[made, 0]), images[captured], depth[captured], *cameras
     )
-    filled = _filled_by_captured(gaussians, world_from_cam, intrinsics_px, generated, *depth.shape[1:])
+    filled = filled_by_captured(gaussians, world_from_cam, intrinsics_px, generated, *depth.shape[1:])
     factors = torch.ones_like(gaussians.opacities)
     factors[made] = 1 - filled * (1 - agrees)
     return factors
@@ -164,7 +164,8 @@ def _agrees(
     return found.weight * torch.where(found.seen, torch.exp(-((off / SAME_COLOUR) ** 2) / 2), 1.0)
 
 
-def _filled_by_captured(
+@torch.no_grad()
+def filled_by_captured(
     gaussians: Gaussians, world_from_cam: Tensor, intrinsics_px: Tensor, generated: Tensor, height: int, width: int
 ) -> Float[Tensor, "made"]:
     """For every generated Gaussian: how far captured Gaussians alone fill its pixel, seen from the view that made it."""

@@ -200,7 +200,7 @@ class _Worker:
         self, grade: str, case: PreparedCase, config: AdaptConfig, seed: int
     ) -> tuple[RoundInputs, WeightsChange, float, int]:
         """(aligned inputs, weights, seconds, steps) of Algorithm 1 alone: rows that differ in what follows share it. The last is kept."""
-        shared = replace(config, trust=False, splat_steps=0)
+        shared = replace(config, trust=False, close_gaps=0.0, splat_steps=0)
         key = grade, shared, seed
         if self._last is None or self._last[0] != key:
             started = time.perf_counter()

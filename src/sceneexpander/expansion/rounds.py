@@ -13,6 +13,7 @@ from torch import Tensor
 from sceneexpander.adaptation.acceptance import Acceptance, AcceptanceLimits, judge_candidate
 from sceneexpander.adaptation.config import AdaptConfig, Realign
 from sceneexpander.adaptation.consistency import pixel_trust, trusted
+from sceneexpander.adaptation.gaps import closed
 from sceneexpander.adaptation.gaussian_head import fit_gaussian_head
 from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, StepRecord, adapt
 from sceneexpander.adaptation.observe import Look
@@ -244,7 +245,7 @@ def adapted_weights(
 def finished_round(
     inputs: RoundInputs, weights: WeightsChange, loaded: LoadedModel, config: AdaptConfig, *, seed: int
 ) -> tuple[ExpansionState, Reconstruction]:
-    """The expanded scene with adapted weights, after what may follow Algorithm 1: the Gaussian head, and fading."""
+    """The expanded scene with adapted weights, after what may follow Algorithm 1: the Gaussian head, closing of gaps, and fading."""
     views, joint_priors = inputs.state.views.append(inputs.inserted.view), inputs.joint_priors
     if config.splat_steps:
         loaded.apply(weights)
@@ -259,6 +260,7 @@ def finished_round(
         weights = WeightsChange.between(loaded.base, loaded.state())
     reconstruction = reconstruct(views, joint_priors, loaded, weights, method="sceneexpander")
     expanded = ExpansionState(views=views, priors=joint_priors, weights=weights)
+    reconstruction = closed(reconstruction, config.close_gaps)
     return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction
 
 

@@ -97,12 +97,15 @@ def test_the_rows_of_the_papers_table_add_one_component_each() -> None:
     assert rows["self_distill"].restore_interval == 0
     assert rows["self_distill_p1"].insertion_probability == 1
     assert rows["full"].restore_interval > 0
-    # The default of the embedded model is the last row and three things beyond the paper.
-    assert replace(rows["full"], realign=Realign.CHOOSE, tone=True, trust=True) == typed(composed()).adapt
+    # The default of the embedded model is the last row and four things beyond the paper.
+    assert (
+        replace(rows["full"], realign=Realign.CHOOSE, tone=True, trust=True, close_gaps=0.7) == typed(composed()).adapt
+    )
     for row in rows.values():
         assert (row.realign, row.splat_steps, row.inserted_weights) == ("none", 0, "uniform")
         assert not row.tone
         assert not row.trust
+        assert row.close_gaps == 0
 
 
 def test_the_controls_take_away_what_they_say() -> None:
