@@ -92,7 +92,7 @@ def trusted(reconstruction: Reconstruction, images: Float[Tensor, "view 3 height
     """The same reconstruction with generated Gaussians as opaque as the captured views let them be, see `trust_factors`."""
     gaussians, generated = reconstruction.gaussians, reconstruction.generated
     cameras = reconstruction.world_from_cam, reconstruction.intrinsics_px
-    factors = trust_factors(gaussians, reconstruction.depth, *cameras, generated, images)
+    factors = trust_factors(gaussians, reconstruction.depth, *cameras, generated, reconstruction.posed, images)
     if factors is None:
         return reconstruction
     return replace(reconstruction, gaussians=replace(gaussians, opacities=gaussians.opacities * factors))
@@ -105,6 +105,7 @@ def trust_factors(
     world_from_cam: Float[Tensor, "view 4 4"],
     intrinsics_px: Float[Tensor, "view 3 3"],
     generated: Bool[Tensor, "view"],
+    posed: Bool[Tensor, "view"],
     images: Float[Tensor, "view 3 height width"],
 ) -> Float[Tensor, "gaussian"] | None:
     """What to multiply opacities by: 1 for captured Gaussians; None if there is nothing to compare.
@@ -113,8 +114,10 @@ def trust_factors(
     see it: what stands in space that a photo looks through fades, and so does what is painted onto a surface that a photo shows
     in another colour. What no captured view sees stays as it is, and so does what fills a gap between the captured views' own
     Gaussians. It also fades a requested object that stands where the photos show it is not.
+
+    A view without a camera (``posed``) neither contradicts nor is contradicted: where its Gaussians are means nothing.
     """
-    captured, made = ~generated, gaussians.generated
+    captured, made = ~generated & posed, gaussians.generated & posed[gaussians.source_view]
     if not bool(made.any()) or not bool(captured.any()):
         return None
     cameras = world_from_cam[captured], intrinsics_px[captured]
@@ -123,7 +126,7 @@ def trust_factors(
     )
     filled = filled_by_captured(gaussians, world_from_cam, intrinsics_px, generated, *depth.shape[1:])
     factors = torch.ones_like(gaussians.opacities)
-    factors[made] = 1 - filled * (1 - agrees)
+    factors[made] = 1 - filled[made] * (1 - agrees)
     return factors
 
 
@@ -137,7 +140,7 @@ def pixel_trust(
     """
     depth, generated = reconstruction.depth, reconstruction.generated
     poses, intrinsics = reconstruction.world_from_cam, reconstruction.intrinsics_px
-    trust, captured = torch.ones_like(depth), ~generated
+    trust, captured = torch.ones_like(depth), ~generated & reconstruction.posed
     if not bool(captured.any()):
         return trust
     cameras = poses[captured], intrinsics[captured]
@@ -167,17 +170,15 @@ def _agrees(
 @torch.no_grad()
 def filled_by_captured(
     gaussians: Gaussians, world_from_cam: Tensor, intrinsics_px: Tensor, generated: Tensor, height: int, width: int
-) -> Float[Tensor, "made"]:
-    """For every generated Gaussian: how far captured Gaussians alone fill its pixel, seen from the view that made it."""
+) -> Float[Tensor, "gaussian"]:
+    """For every Gaussian of a generated view: how far captured Gaussians alone fill its pixel, seen from that view. 0 for the others."""
     taken = gaussians.select(~gaussians.generated)
-    sources = gaussians.source_view[gaussians.generated]
-    points = gaussians.means[gaussians.generated]
-    filled = torch.zeros_like(points[:, 0])
+    filled = torch.zeros_like(gaussians.opacities)
     for view in torch.nonzero(generated)[:, 0].tolist():
         camera = world_from_cam[view][None], intrinsics_px[view][None]
         alpha = render(taken, *camera, height, width).alpha
-        own = sources == view
-        there, _, in_frame = seen_at(points[own], alpha[:, None], *camera, "bilinear")
+        own = gaussians.source_view == view
+        there, _, in_frame = seen_at(gaussians.means[own], alpha[:, None], *camera, "bilinear")
         filled[own] = torch.where(in_frame[0], there[0, 0], 0.0).clamp(0, 1)
     return filled
 

@@ -41,10 +41,7 @@ def closed(reconstruction: Reconstruction, reach: float) -> Reconstruction:
     gaussians = reconstruction.gaussians
     poses, intrinsics = reconstruction.world_from_cam, reconstruction.intrinsics_px
     height, width = reconstruction.depth.shape[1:]
-    filled = torch.ones_like(gaussians.opacities)
-    filled[gaussians.generated] = filled_by_captured(
-        gaussians, poses, intrinsics, reconstruction.generated, height, width
-    )
+    filled = filled_by_captured(gaussians, poses, intrinsics, reconstruction.generated, height, width)
     scales, quats = gaussians.scales.clone(), gaussians.quat_wxyz.clone()
     for view in generated:
         own = torch.nonzero(gaussians.source_view == view)[:, 0]

@@ -136,7 +136,9 @@ def _factors(
     found = model.predict(images, priors, heads=_HEADS, generated=generated)
     if found.gaussians is None or found.depth is None:
         return None
-    return trust_factors(found.gaussians, found.depth, found.world_from_cam, found.intrinsics_px, generated, images)
+    posed = torch.ones_like(generated) if priors is None or priors.posed is None else priors.posed
+    cameras = found.world_from_cam, found.intrinsics_px
+    return trust_factors(found.gaussians, found.depth, *cameras, generated, posed, images)
 
 
 def _error(prediction: Prediction, images: Tensor, view: int, config: AdaptConfig) -> Tensor:

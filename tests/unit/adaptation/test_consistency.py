@@ -123,6 +123,19 @@ def test_what_no_photo_sees_stays() -> None:
     assert float(kept(1.6, 0.9).min()) == 1.0
 
 
+def test_a_generated_view_without_a_camera_keeps_its_opacity() -> None:
+    before, images = scene_of_two(0.7, 0.9)
+    lost = replace(before, posed=torch.tensor([True, False]))
+    assert trusted(lost, images) is lost
+
+
+def test_a_photo_without_a_camera_contradicts_nothing() -> None:
+    before, images = scene_of_two(0.7, 0.9)
+    lost = replace(before, posed=torch.tensor([False, True]))
+    assert trusted(lost, images) is lost
+    assert bool((pixel_trust(lost, images) == 1).all())
+
+
 def test_without_generated_views_nothing_changes() -> None:
     made, images = scene_of_two(1.0, 0.5)
     alone = replace(
