@@ -21,6 +21,7 @@ from sceneexpander.splatting import render
 
 SAME_SURFACE = 0.04  # log-depth difference that still counts as the same surface
 SAME_COLOUR = 0.1  # mean absolute RGB difference, the same way
+LOST = 0.3  # of its opacity is what a Gaussian keeps whose view has no camera
 _HIDDEN = 3 * SAME_SURFACE  # a point further behind what a view sees is hidden from it
 
 
@@ -115,17 +116,19 @@ def trust_factors(
     in another colour. What no captured view sees stays as it is, and so does what fills a gap between the captured views' own
     Gaussians. It also fades a requested object that stands where the photos show it is not.
 
-    A view without a camera (``posed``) neither contradicts nor is contradicted: where its Gaussians are means nothing.
+    Where the Gaussians of a view without a camera (``posed``) are means nothing, so nothing is compared with them or with it. They
+    would stand in front of the photos, so they are made faint (`LOST`); a fit makes of them what the photos can use.
     """
-    captured, made = ~generated & posed, gaussians.generated & posed[gaussians.source_view]
-    if not bool(made.any()) or not bool(captured.any()):
+    captured, placed = ~generated & posed, posed[gaussians.source_view]
+    made = gaussians.generated & placed
+    if not bool(gaussians.generated.any()) or not bool(captured.any()):
         return None
     cameras = world_from_cam[captured], intrinsics_px[captured]
     agrees = _agrees(
         gaussians.means[made], rgb_from_sh(gaussians.sh[made, 0]), images[captured], depth[captured], *cameras
     )
     filled = filled_by_captured(gaussians, world_from_cam, intrinsics_px, generated, *depth.shape[1:])
-    factors = torch.ones_like(gaussians.opacities)
+    factors = torch.where(gaussians.generated & ~placed, LOST, torch.ones_like(gaussians.opacities))
     factors[made] = 1 - filled[made] * (1 - agrees)
     return factors
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from sceneexpander.adaptation.consistency import Agreement, agreement, inserted_weights, pixel_trust, trusted
+from sceneexpander.adaptation.consistency import LOST, Agreement, agreement, inserted_weights, pixel_trust, trusted
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.models.pixel_aligned import pixel_aligned
@@ -123,10 +123,13 @@ def test_what_no_photo_sees_stays() -> None:
     assert float(kept(1.6, 0.9).min()) == 1.0
 
 
-def test_a_generated_view_without_a_camera_keeps_its_opacity() -> None:
-    before, images = scene_of_two(0.7, 0.9)
-    lost = replace(before, posed=torch.tensor([True, False]))
-    assert trusted(lost, images) is lost
+def test_a_generated_view_without_a_camera_is_faint_wherever_it_stands() -> None:
+    for factor, colour in ((1.0, 0.5), (0.7, 0.9), (1.6, 0.9)):
+        before, images = scene_of_two(factor, colour)
+        after = trusted(replace(before, posed=torch.tensor([True, False])), images)
+        made, opacities = before.gaussians.generated, before.gaussians.opacities
+        assert torch.equal(after.gaussians.opacities[made], LOST * opacities[made])
+        assert torch.equal(after.gaussians.opacities[~made], opacities[~made])
 
 
 def test_a_photo_without_a_camera_contradicts_nothing() -> None:
