@@ -6,6 +6,7 @@ Unknown, missing and mistyped keys are refused with the full key and a suggestio
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -83,6 +84,9 @@ def _parse_scalar(hint: Any, value: object, where: str) -> Any:
     if hint is Path and isinstance(value, str):
         return Path(value)
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        # No setting has a use for infinity, and JSON, which results are kept in, has no way to write it.
+        if not math.isfinite(value):
+            raise ConfigError(f"is {value}, expected a finite number", where=where)
         return float(value)
     if hint is int and isinstance(value, int) and not isinstance(value, bool):
         return value

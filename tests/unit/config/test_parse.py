@@ -84,6 +84,8 @@ def test_every_kind_of_field() -> None:
         ({"many": 4}, "many: is 4 (int), expected a list"),
         ({"inner": 4}, "inner: is 4 (int), expected a section with keys"),
         ({"inner": {"rate": -1}}, "inner: rate must be >= 0, is -1.0"),
+        ({"inner": {"rate": float("inf")}}, "inner.rate: is inf, expected a finite number"),
+        ({"pair": [1, float("nan")]}, "pair[1]: is nan, expected a finite number"),
     ],
 )
 def test_one_line_that_names_the_key(change: dict[str, Any], message: str) -> None:
