@@ -68,6 +68,11 @@ def anchors(scene: str, number: int) -> Path:
     return round_folder(scene, number) / "anchors"
 
 
+def cameras(folder: Path) -> Path:
+    """The `CameraReport` beside the state or the joint priors in ``folder``; absent for models that need no cameras."""
+    return folder / "cameras"
+
+
 def joint_priors(scene: str, number: int) -> Path:
     """`Priors` of all views, the inserted one included."""
     return round_folder(scene, number) / "joint_priors"

@@ -15,13 +15,38 @@ from torch import Tensor
 
 from sceneexpander.artifacts.store import ArtifactError, load_artifact, save_artifact
 
-SCHEMA = "views/1"
+SCHEMA = "views/2"
 Affine = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LensFacts:
+    """What a file says of the camera and lens that took it. Hints: edited, cropped and forwarded files keep wrong values.
+
+    Attributes:
+        camera: maker and model; empty if not said.
+        lens: the lens, or what else tells one lens of a device from another; empty if not said.
+        focal_mm: focal length in millimetres as written, without any crop factor.
+        focal_px: focal length in *original* pixels, digital zoom included; None if the file does not allow to work it out.
+        focal_rule: how ``focal_px`` was worked out, in words for people ("35 mm equivalent", "focal length and sensor"); empty without.
+        exif_size: (height, width) that the camera wrote down, upright; another aspect ratio than the file's means that it was cropped.
+    """
+
+    camera: str = ""
+    lens: str = ""
+    focal_mm: float | None = None
+    focal_px: float | None = None
+    focal_rule: str = ""
+    exif_size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRecord:
-    """Where a view came from. ``stored_from_original`` maps original to stored pixel coordinates (corner origin, 2x3)."""
+    """Where a view came from. ``stored_from_original`` maps original to stored pixel coordinates (corner origin, 2x3).
+
+    ``distortion`` is (k1, k2) of the lens that was taken out of the stored picture: the affine map then leads from the original's
+    pixels *after* undistortion. (0, 0) for pictures stored as they were.
+    """
 
     view_id: str  # unique within the scene and safe as a file name, e.g. "000_DSC_0286"
     name: str  # the original file name
@@ -31,6 +56,8 @@ class ViewRecord:
     stored_from_original: Affine
     generated: bool = False
     round: int = 0  # 0: captured; k: inserted in round k
+    lens: LensFacts | None = None
+    distortion: tuple[float, float] = (0.0, 0.0)
 
     def original_from_stored(self) -> Affine:
         """The inverse map, from stored to original pixel coordinates."""
@@ -127,7 +154,14 @@ class ViewSet:
 def _record_from_plain(item: dict[str, Any]) -> ViewRecord:
     rows = item["stored_from_original"]
     affine: Affine = ((rows[0][0], rows[0][1], rows[0][2]), (rows[1][0], rows[1][1], rows[1][2]))
-    return replace(ViewRecord(**item), stored_from_original=affine)
+    lens = item.get("lens")
+    if lens is not None:
+        size = lens["exif_size"]
+        lens = LensFacts(**{**lens, "exif_size": None if size is None else (size[0], size[1])})
+    distortion = item.get("distortion", (0.0, 0.0))
+    return replace(
+        ViewRecord(**item), stored_from_original=affine, lens=lens, distortion=(distortion[0], distortion[1])
+    )
 
 
 def to_uint8(image: Float[Tensor, "3 height width"]) -> np.ndarray[Any, np.dtype[np.uint8]]:
