@@ -6,24 +6,48 @@ pruning keep it consistent. All poses are ``cam_from_world``; pixels are those o
 
 from __future__ import annotations
 
-import cv2
+import copy
+from dataclasses import dataclass, replace
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sceneexpander.frontend.bundle import BundleProblem, BundleResult, adjust
-from sceneexpander.frontend.sfm_types import SfmConfig
+from sceneexpander.frontend.bundle import (
+    LENS_PARAMETERS,
+    LOG_FOCAL,
+    SHIFT_X,
+    SHIFT_Y,
+    BundleProblem,
+    BundleResult,
+    Lenses,
+    adjust,
+    direction_sigma_deg,
+)
+from sceneexpander.frontend.resection import Sighting, intrinsics_through, judge_view, resect, solve_pose
+from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, SfmConfig
 from sceneexpander.frontend.tracks import Tracks
 from sceneexpander.frontend.twoview import (
     RelativePose,
     homogeneous_rays,
     ray_angle_deg,
     triangulate_pair,
-    usac_parameters,
 )
 
 _PRIOR_INFLATION = 8.0  # matching errors are correlated and partly systematic: that many of them count as one
 _NEIGHBOURS = 8
 _NEIGHBOUR_GAP = 0.2  # of the logarithm of depth: neighbours nearer than this agree
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CropOfMain:
+    """A view that may be a part cut out of a picture of the main lens: its principal point can then lie off the centre.
+
+    ``log_focal`` is the factor on its start focal while the main lens has its own start focal; the limits are shifts of its lens.
+    """
+
+    log_focal: float
+    limit_x: float
+    limit_y: float
 
 
 class Mapping:
@@ -34,8 +58,15 @@ class Mapping:
         rotations, translations: ``cam_from_world``; meaningless where not registered.
         points, valid: world points of the tracks, and which exist.
         active: observations that agree with their point.
-        log_focal: logarithm of the shared factor on the start intrinsics.
-        focal_sigma: its standard deviation after the last adjustment that refined it.
+        lens_of: the lens of each view, numbered by one of the views that have it.
+        lenses: what views of one lens share, relative to the start intrinsics. ``free`` says what may be refined once there are views
+            enough. Distortion stays zero here: pixels are undistorted before they come in.
+        prior_sigma: standard deviations of the priors in ``lenses`` (inf: none); their weight follows the noise.
+        lens_guesses: per view of another lens than most, further factors (logarithms) that its start focal may be off by.
+        crops: the views that may be parts cut out of pictures of the main lens.
+        main: a view with the lens that most views have.
+        lens_sigma: standard deviations after the last adjustment that refined something.
+        penalty: what `score` takes off for assumptions that went into the start.
     """
 
     def __init__(
@@ -46,14 +77,28 @@ class Mapping:
         *,
         unit_px: float,
         seed: int,
+        lens_of: Int[np.ndarray, " view"] | None = None,
+        shift_unit_px: Float[np.ndarray, "view 2"] | None = None,
+        lenses: Lenses | None = None,
+        prior_sigma: Float[np.ndarray, "lens 5"] | None = None,
+        guesses: dict[int, tuple[float, ...]] | None = None,
+        crops: dict[int, CropOfMain] | None = None,
+        main: int = 0,
+        penalty: float = 0.0,
     ) -> None:
         views = intrinsics.shape[0]
         self.tracks, self.config, self.unit_px, self.seed = tracks, config, unit_px, seed
         self.start_intrinsics = intrinsics
-        self.log_focal = 0.0
-        self.log_focal_bounds = (-np.inf, np.inf)
-        self.log_focal_prior = (0.0, np.inf)  # centre, sigma
-        self.focal_sigma = float("nan")
+        self.lens_of = np.zeros(views, np.int64) if lens_of is None else lens_of.copy()
+        long_side = REFERENCE_LONG_SIDE_PX * unit_px
+        self.shift_unit_px = np.full((views, 2), long_side) if shift_unit_px is None else shift_unit_px
+        self.lenses = Lenses.nominal(views) if lenses is None else lenses
+        self.prior_sigma = np.full((views, LENS_PARAMETERS), np.inf) if prior_sigma is None else prior_sigma
+        self.lens_guesses = {} if guesses is None else guesses
+        self.crops = {} if crops is None else crops
+        self.main = main
+        self.lens_sigma = np.full((views, LENS_PARAMETERS), np.inf)
+        self.penalty = penalty
         self.rotations = np.tile(np.eye(3), (views, 1, 1))
         self.translations = np.zeros((views, 3))
         self.registered = np.zeros(views, bool)
@@ -65,10 +110,13 @@ class Mapping:
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "view 3 3"]:
-        """Intrinsics with the current focal."""
-        scaled = self.start_intrinsics.copy()
-        scaled[:, [0, 1], [0, 1]] *= np.exp(self.log_focal)
-        return scaled
+        """Intrinsics with what is known of the lenses now."""
+        return intrinsics_through(self.start_intrinsics, self.shift_unit_px, self.lenses.resolved[self.lens_of])
+
+    @property
+    def log_focal(self) -> Float[np.ndarray, " view"]:
+        """Logarithm of each view's factor on its start focal."""
+        return self.lenses.resolved[self.lens_of, LOG_FOCAL]
 
     @property
     def centres(self) -> Float[np.ndarray, "view 3"]:
@@ -112,11 +160,20 @@ class Mapping:
         self.rotations[view_b], self.translations[view_b] = pose.rotation, pose.translation
         self.registered[[view_a, view_b]] = True
 
+    def copy(self) -> Mapping:
+        """A model that can change without this one."""
+        other = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(other, name, value.copy())
+        return other
+
     def adopt(self, other: Mapping) -> None:
-        """Take over cameras and focal of a model of the same views over other tracks."""
+        """Take over cameras and lenses of a model of the same views over other tracks."""
         self.rotations, self.translations = other.rotations.copy(), other.translations.copy()
         self.registered = other.registered.copy()
-        self.log_focal, self.focal_sigma = other.log_focal, other.focal_sigma
+        self.lens_of, self.lenses, self.lens_sigma = other.lens_of.copy(), other.lenses, other.lens_sigma
+        self.prior_sigma, self.penalty = other.prior_sigma, other.penalty
 
     def triangulate(self, *, threshold_px: float) -> None:
         """Find points for tracks that have none, from the best pair of their views.
@@ -188,25 +245,98 @@ class Mapping:
         return best if visible[best] >= self.config.min_register_inliers else None
 
     def register(self, view: int) -> bool:
-        """Pose a view from the points it sees; False if too few of them agree on a pose."""
+        """Pose a view from the points it sees; False if too few of them agree on a pose.
+
+        Where no view with its lens is in the model yet, or the lens explains few of the points, other focals are tried; one that
+        explains clearly more makes the view a lens of its own.
+        """
         rows = np.flatnonzero(self.tracks.seen[:, view] & self.valid)
-        found = solve_pose(
-            self.points[rows],
-            self.tracks.pixel_xy[rows, view],
-            self.intrinsics[view],
-            threshold_px=self.config.register_px * self.unit_px,
-            robust_px=self.config.robust_px * self.unit_px,
+        sighting = self.sighting(view, rows)
+        current = self.lenses.resolved[self.lens_of[view]]
+        pose = solve_pose(
+            sighting.points,
+            sighting.pixel_xy,
+            sighting.through(current),
+            threshold_px=sighting.threshold_px,
+            robust_px=sighting.noise_px,
             seed=self.seed,
         )
-        if found is None:
+        found = None if pose is None else judge_view(sighting, pose[0], pose[1], current)
+        alone = not (self.registered & (self.lens_of == self.lens_of[view])).any()
+        agreeing = 0 if found is None else int(found.inlier.sum())
+        if alone or agreeing < self.config.focal_doubt_share * len(rows):
+            other = resect(sighting, self.log_focals_to_try(view, alone))
+            if other is not None and (
+                found is None or other.cost < (1.0 if alone else self.config.split_cost) * found.cost
+            ):
+                if not alone:
+                    self.split_lens(view)
+                self.set_lens(view, other.lens)
+                found = other
+        if found is None or found.inlier.sum() < max(
+            self.config.min_register_inliers, self.config.min_register_share * len(rows)
+        ):
             return False
-        rotation, translation, inlier = found
-        if inlier.sum() < max(self.config.min_register_inliers, self.config.min_register_share * len(rows)):
-            return False
-        self.rotations[view], self.translations[view] = rotation, translation
+        self.rotations[view], self.translations[view] = found.rotation, found.translation
         self.registered[view] = True
-        self.active[rows, view] = inlier
+        self.active[rows, view] = found.inlier
         return True
+
+    def sighting(self, view: int, rows: Int[np.ndarray, " row"]) -> Sighting:
+        """What a view sees of the points of some tracks."""
+        row = self.lens_of[view]
+        return Sighting(
+            points=self.points[rows],
+            pixel_xy=self.tracks.pixel_xy[rows, view],
+            start=self.start_intrinsics[view],
+            shift_unit_px=self.shift_unit_px[view],
+            log_focal_low=float(self.lenses.low[row, LOG_FOCAL]),
+            log_focal_high=float(self.lenses.high[row, LOG_FOCAL]),
+            threshold_px=self.config.register_px * self.unit_px,
+            noise_px=self.config.robust_px * self.unit_px,
+            seed=self.seed,
+        )
+
+    def log_focals_to_try(self, view: int, alone: bool) -> list[float]:
+        """Factors on a view's start focal: a grid over all that is plausible and, with no view of its lens posed, the guesses."""
+        row, step = self.lens_of[view], float(np.log(self.config.focal_step))
+        grid = np.arange(self.lenses.low[row, LOG_FOCAL] + step / 2, self.lenses.high[row, LOG_FOCAL], step).tolist()
+        return [0.0, *self.lens_guesses.get(view, ()), *grid] if alone else grid
+
+    def set_lens(self, view: int, lens: Float[np.ndarray, " 5"]) -> None:
+        """Give the lens of a view other values."""
+        row = self.lens_of[view]
+        values, focal_of, offset = self.lenses.values.copy(), self.lenses.focal_of.copy(), self.lenses.offset.copy()
+        values[row], focal_of[row], offset[row] = lens, row, 0.0
+        self.lenses = replace(self.lenses, values=values, focal_of=focal_of, offset=offset)
+
+    def split_lens(self, view: int) -> None:
+        """Make a view a lens of its own, with the values of the one it had and little held against another focal."""
+        old = int(self.lens_of[view])
+        others = np.flatnonzero((self.lens_of == old) & (np.arange(len(self.lens_of)) != view))
+        if len(others) == 0:
+            return
+        names = ("values", "free", "low", "high", "prior", "focal_of", "offset")
+        tables = {name: getattr(self.lenses, name).copy() for name in names}
+        tables["sigma"] = self.prior_sigma.copy()
+        if old == view:  # the lens goes on under the number of another view that has it
+            heir = int(others[0])
+            for table in tables.values():
+                table[heir] = table[view]
+            self.lens_sigma[heir] = self.lens_sigma[view]
+            self.lens_of[others] = heir
+            tables["focal_of"][tables["focal_of"] == view] = heir
+            old = heir
+        for table in tables.values():
+            table[view] = table[old]
+        tables["focal_of"][view], tables["offset"][view] = view, 0.0
+        tables["free"][view, LOG_FOCAL] = True
+        tables["sigma"][view, LOG_FOCAL] = self.config.split_focal_sigma
+        tables["prior"][view, LOG_FOCAL] = tables["values"][old, LOG_FOCAL]
+        self.lens_of[view] = view
+        self.prior_sigma = tables.pop("sigma")
+        self.lenses = replace(self.lenses, **tables)
+        self.penalty += self.config.split_penalty
 
     def grow(self, *, refine_focal: bool, free: Bool[np.ndarray, " view"] | None = None) -> None:
         """Register views until none fits any more, adjusting after each."""
@@ -253,6 +383,82 @@ class Mapping:
         robust_px: float | None = None,
     ) -> BundleResult | None:
         """Bundle adjustment of all registered views and points (``free``: which cameras may move)."""
+        problem = self._problem(self.lenses.free & refine_focal, self.prior_sigma, free=free, robust_px=robust_px)
+        if problem is None:
+            return None
+        result = adjust(problem, max_iterations=iterations or self.config.bundle_iterations)
+        self.take(result)
+        if refine_focal:
+            self.lens_sigma = result.lens_sigma * problem.robust_px * _PRIOR_INFLATION**0.5
+        return result
+
+    def compare(
+        self,
+        free: Bool[np.ndarray, "lens 5"],
+        prior_sigma: Float[np.ndarray, "lens 5"],
+        *,
+        pixel_xy: Float[np.ndarray, "track view 2"] | None = None,
+        values: Float[np.ndarray, "lens 5"] | None = None,
+    ) -> BundleResult | None:
+        """What adjustment would make of lenses that are held otherwise, at the scale of the present errors. Changes nothing."""
+        errors = self.errors_px()[self.active & self.registered]
+        if len(errors) == 0:
+            return None
+        noise = float(np.clip(np.median(errors) / self.unit_px, self.config.min_robust_px / 2, self.config.robust_px))
+        problem = self._problem(free, prior_sigma, robust_px=noise, pixel_xy=pixel_xy, values=values)
+        return None if problem is None else adjust(problem, max_iterations=2 * self.config.bundle_iterations)
+
+    def direction_sigma_deg(self) -> Float[np.ndarray, "view view"]:
+        """Standard deviation of the direction from each view to each other, at the present errors; NaN where not registered.
+
+        Errors are correlated, as for priors: they count as fewer than there are.
+        """
+        errors = self.errors_px()[self.active & self.registered]
+        views = len(self.registered)
+        problem = None
+        if len(errors):
+            noise = float(np.median(errors)) / 1.18  # of two dimensions
+            problem = self._problem(self.lenses.free, self.prior_sigma, robust_px=noise / self.unit_px)
+        if problem is None:
+            return np.full((views, views), np.nan)
+        return direction_sigma_deg(problem) * problem.robust_px * _PRIOR_INFLATION**0.5
+
+    def take(self, result: BundleResult) -> None:
+        """Make an adjustment's result the model."""
+        self.rotations, self.translations = result.problem.rotations, result.problem.translations
+        self.points[np.flatnonzero(self.valid)] = result.problem.points
+        self.lenses = replace(self.lenses, values=result.problem.lenses.values)
+
+    def intrinsics_of(self, result: BundleResult) -> Float[np.ndarray, "view 3 3"]:
+        """Intrinsics after an adjustment that was not taken."""
+        return intrinsics_through(
+            self.start_intrinsics, self.shift_unit_px, result.problem.lenses.resolved[self.lens_of]
+        )
+
+    def follow_focal(self, view: int, other: int, offset: float) -> None:
+        """From now on the focal of a view's lens is that of another view's, ``offset`` (logarithm) apart."""
+        focal_of, offsets = self.lenses.focal_of.copy(), self.lenses.offset.copy()
+        focal_of[self.lens_of[view]], offsets[self.lens_of[view]] = self.lens_of[other], offset
+        self.lenses = replace(self.lenses, focal_of=focal_of, offset=offsets)
+
+    def let_shift(self, view: int, sigma: float) -> None:
+        """From now on refine the principal point of a view's lens, too."""
+        free, prior_sigma = self.lenses.free.copy(), self.prior_sigma.copy()
+        free[self.lens_of[view], SHIFT_X : SHIFT_Y + 1] = True
+        prior_sigma[self.lens_of[view], SHIFT_X : SHIFT_Y + 1] = sigma
+        self.lenses, self.prior_sigma = replace(self.lenses, free=free), prior_sigma
+
+    def _problem(
+        self,
+        lens_free: Bool[np.ndarray, "lens 5"],
+        prior_sigma: Float[np.ndarray, "lens 5"],
+        *,
+        free: Bool[np.ndarray, " view"] | None = None,
+        robust_px: float | None = None,
+        pixel_xy: Float[np.ndarray, "track view 2"] | None = None,
+        values: Float[np.ndarray, "lens 5"] | None = None,
+    ) -> BundleProblem | None:
+        """The model as bundle adjustment takes it; None if there is too little of it."""
         rows, views = np.nonzero(self.active & self.registered)
         if len(rows) < 6:
             return None
@@ -262,9 +468,9 @@ class Mapping:
         if free is None:
             free = self.registered.copy()
             free[np.flatnonzero(self.registered)[0]] = False
-        centre, sigma = self.log_focal_prior
         noise = (robust_px or self.config.robust_px) * self.unit_px
-        problem = BundleProblem(
+        seen_at = self.tracks.pixel_xy if pixel_xy is None else pixel_xy
+        return BundleProblem(
             rotations=self.rotations,
             translations=self.translations,
             focals_px=self.start_intrinsics[:, [0, 1], [0, 1]],
@@ -272,89 +478,23 @@ class Mapping:
             points=self.points[used],
             camera_index=views,
             point_index=position[rows],
-            pixel_xy=self.tracks.pixel_xy[rows, views],
+            pixel_xy=seen_at[rows, views],
             camera_free=free & self.registered,
-            focal_free=refine_focal,
-            log_focal=self.log_focal,
-            log_focal_bounds=self.log_focal_bounds,
-            log_focal_prior=centre,
-            log_focal_weight=_PRIOR_INFLATION * (noise / sigma) ** 2,
+            lens_index=self.lens_of,
+            lenses=replace(
+                self.lenses,
+                values=self.lenses.values if values is None else values,
+                free=lens_free,
+                weight=_PRIOR_INFLATION * (noise / prior_sigma) ** 2,
+            ),
+            shift_unit_px=self.shift_unit_px,
             robust_px=noise,
         )
-        result = adjust(problem, max_iterations=iterations or self.config.bundle_iterations)
-        self.rotations, self.translations = result.problem.rotations, result.problem.translations
-        self.points[used] = result.problem.points
-        self.log_focal = result.problem.log_focal
-        if refine_focal:
-            self.focal_sigma = result.log_focal_sigma * noise * _PRIOR_INFLATION**0.5
-        return result
 
     def score(self) -> float:
-        """How much the model explains: sum over observations of 1 - (e / threshold)^2, less the focal prior's cost."""
+        """How much the model explains: sum over observations of 1 - (e / threshold)^2, less what its lenses' priors cost."""
         limit = self.config.inlier_px * self.unit_px
         explained = np.maximum(1.0 - (self.errors_px()[self.active & self.registered] / limit) ** 2, 0.0).sum()
-        centre, sigma = self.log_focal_prior
-        return float(explained - _PRIOR_INFLATION * ((self.log_focal - centre) / sigma) ** 2 / 2)
-
-
-def solve_pose(
-    points: Float[np.ndarray, "point 3"],
-    pixel_xy: Float[np.ndarray, "point 2"],
-    intrinsics: Float[np.ndarray, "3 3"],
-    *,
-    threshold_px: float,
-    robust_px: float,
-    seed: int,
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], Bool[np.ndarray, " point"]] | None:
-    """``cam_from_world`` (rotation, translation) from 2D-3D correspondences and the inlier mask; None if none fits.
-
-    P3P inside MAGSAC, then robust refinement of the pose alone on the inliers, twice.
-    """
-    if len(points) < 6:
-        return None
-    try:
-        found, _, vector, translation, _ = cv2.solvePnPRansac(
-            points, pixel_xy, intrinsics.copy(), None, params=usac_parameters(threshold_px, seed)
-        )
-    except cv2.error:  # as in `twoview`: degenerate samples can leave the local optimisation without a model
-        return None
-    if not found or not (np.isfinite(vector).all() and np.isfinite(translation).all()):
-        return None
-    rotation, translation = cv2.Rodrigues(vector)[0], translation.ravel()
-    inlier = pose_inliers(points, pixel_xy, intrinsics, rotation, translation, threshold_px)
-    for _ in range(2):
-        if inlier.sum() < 6:
-            return None
-        count = int(inlier.sum())
-        problem = BundleProblem(
-            rotations=rotation[None],
-            translations=translation[None],
-            focals_px=intrinsics[[0, 1], [0, 1]][None],
-            centres_px=intrinsics[None, :2, 2],
-            points=points[inlier],
-            camera_index=np.zeros(count, np.int64),
-            point_index=np.arange(count),
-            pixel_xy=pixel_xy[inlier],
-            camera_free=np.ones(1, bool),
-            points_free=False,
-            robust_px=robust_px,
-        )
-        refined = adjust(problem, max_iterations=20).problem
-        rotation, translation = refined.rotations[0], refined.translations[0]
-        inlier = pose_inliers(points, pixel_xy, intrinsics, rotation, translation, threshold_px)
-    return rotation, translation, inlier
-
-
-def pose_inliers(
-    points: Float[np.ndarray, "point 3"],
-    pixel_xy: Float[np.ndarray, "point 2"],
-    intrinsics: Float[np.ndarray, "3 3"],
-    rotation: Float[np.ndarray, "3 3"],
-    translation: Float[np.ndarray, " 3"],
-    threshold_px: float,
-) -> Bool[np.ndarray, " point"]:
-    """Points in front of the camera that project within the threshold of their pixel."""
-    in_camera = points @ rotation.T + translation
-    projected = in_camera @ intrinsics.T
-    xy = projected[:, :2] / np.maximum(projected[:, 2:], 1e-9)
-    return (in_camera[:, 2] > 1e-6) & (np.linalg.norm(xy - pixel_xy, axis=1) < threshold_px)
+        used = np.unique(self.lens_of[self.registered])
+        pulls = ((self.lenses.values - self.lenses.prior) / self.prior_sigma)[used]
+        return float(explained - _PRIOR_INFLATION * (pulls**2).sum() / 2 - self.penalty)

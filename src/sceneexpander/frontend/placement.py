@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneexpander.frontend.features import Features
-from sceneexpander.frontend.mapping import Mapping, solve_pose
+from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.resection import solve_pose
 from sceneexpander.frontend.sfm_types import SfmConfig
 from sceneexpander.frontend.twoview import (
     PairMatches,

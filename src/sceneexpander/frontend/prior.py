@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, checked_share, dense_depth
@@ -52,7 +52,7 @@ def build_priors(
         judge=picture_judge(images, config.dense),
     )
     dense = dense_depth(
-        images.cpu(),
+        straightened(images, sparse)[0],
         sparse.world_from_cam,
         sparse.intrinsics_px,
         sparse.sparse,
@@ -80,7 +80,7 @@ def picture_judge(images: Float[Tensor, "view 3 height width"], dense: DenseConf
 
     def judge(candidate: SparseReconstruction) -> float:
         return checked_share(
-            images.cpu(),
+            straightened(images, candidate)[0],
             candidate.world_from_cam,
             candidate.intrinsics_px,
             candidate.sparse,
@@ -89,6 +89,15 @@ def picture_judge(images: Float[Tensor, "view 3 height width"], dense: DenseConf
         )
 
     return judge
+
+
+def straightened(
+    images: Float[Tensor, "view 3 height width"], found: SparseReconstruction
+) -> tuple[Float[Tensor, "view 3 height width"], Bool[Tensor, "view height width"] | None]:
+    """The pictures as pinhole cameras see them, and where they show something; as they are (and None) if the lens bends nothing."""
+    if found.distortion is None:
+        return images.cpu(), None
+    return found.distortion.straightened(images.cpu())
 
 
 def rescaled(reconstruction: SparseReconstruction, scale: float) -> SparseReconstruction:

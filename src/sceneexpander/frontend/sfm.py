@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,12 +18,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
+from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.features import Features, detect_features
-from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.lens_tests import find_distortion, settle_lenses
+from sceneexpander.frontend.lenses import FocalStart, LensPlan, ViewOptics
+from sceneexpander.frontend.mapping import CropOfMain, Mapping
 from sceneexpander.frontend.matching import Matches
 from sceneexpander.frontend.placement import place_remaining, thumbnails_of
 from sceneexpander.frontend.sfm_report import build_reconstruction
-from sceneexpander.frontend.sfm_setup import FocalPlan, KnownCameras, Setup, known_cameras, prepare
+from sceneexpander.frontend.sfm_setup import KnownCameras, Setup, known_cameras, prepare
 from sceneexpander.frontend.sfm_types import (
     FocalSource,
     LearnedUse,
@@ -70,6 +74,7 @@ def estimate_cameras(
     focal_hint_px: float | None = None,
     names: Sequence[str] | None = None,
     judge: Judge | None = None,
+    optics: Sequence[ViewOptics] | None = None,
 ) -> SparseReconstruction:
     """Poses, intrinsics and sparse points of S >= 1 views. Never fails on hard images: see ``report`` and ``posed``.
 
@@ -84,6 +89,8 @@ def estimate_cameras(
             otherwise.
         focal_hint_px: focal of all views in pixels of ``images`` (EXIF): a strong hint, still refined.
         names: of the views, for the report.
+        optics: per view how it lies on its original and what its file says of the lens; without, all views share one lens and
+            are their own originals.
         judge: says how well a candidate fits the pictures (higher is better), for `LearnedUse.CHOOSE`: among the candidates that
             pose most views the best one is taken. Repeated windows, stripes and tiles give models that explain their own
             matches well and the pictures badly.
@@ -94,11 +101,15 @@ def estimate_cameras(
     """
     setup = prepare(images, feature_images, config, generator, names)
     known = known_cameras(setup, known_intrinsics_px, known_world_from_cam)
-    focal = FocalPlan.make(config, setup, known, focal_hint_px)
-    model = _model([detect_features(grey, config) for grey in setup.greys], None, known, focal, config, setup)
+    height, width = images.shape[-2:]
+    own = [ViewOptics.of_whole_image(height, width)] * len(images) if optics is None else list(optics)
+    if len(own) != len(images):
+        raise ValueError(f"{len(own)} optics for {len(images)} views")
+    plan = LensPlan.make(config, setup, known, own, focal_hint_px)
+    model = _model([detect_features(grey, config) for grey in setup.greys], None, known, plan, config, setup)
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
     if choosing and judge is not None and not known.posed.all():
-        candidates = [model, *_learned_models(model, (False, True), known, focal, config, setup)]
+        candidates = [model, *_learned_models(model, (False, True), known, plan, config, setup)]
         finished = [_reconstruction(candidate, config, setup) for candidate in candidates]
         if len(finished) == 1:
             return finished[0]
@@ -107,7 +118,7 @@ def estimate_cameras(
         _log.info("camera models: (views posed, share that fits) %s, number %d taken", verdicts, best)
         return finished[best]
     if config.learned is LearnedUse.ALWAYS or (config.learned is not LearnedUse.NEVER and model.left_out.any()):
-        for joined in _learned_models(model, (False,), known, focal, config, setup):
+        for joined in _learned_models(model, (False,), known, plan, config, setup):
             if config.learned is LearnedUse.ALWAYS or joined.left_out.sum() < model.left_out.sum():
                 model = joined
     return _reconstruction(model, config, setup)
@@ -127,7 +138,14 @@ def _reconstruction(model: _Model, config: SfmConfig, setup: Setup) -> SparseRec
         for p, kind in zip(model.pairs, model.kinds, strict=True)
     )
     return build_reconstruction(
-        mapping, placed, model.features, pair_reports, model.focal_source, setup.names, setup.scale_xy
+        mapping,
+        placed,
+        model.features,
+        pair_reports,
+        model.focal_source,
+        setup.names,
+        setup.scale_xy,
+        distortion=model.distortion,
     )
 
 
@@ -140,6 +158,7 @@ class _Model:
     kinds: list[PairKind]
     mapping: Mapping
     focal_source: FocalSource
+    distortion: Distortion | None  # what the keypoints were straightened by
 
     @property
     def left_out(self) -> Bool[np.ndarray, " view"]:
@@ -160,11 +179,36 @@ def _model(
     features: list[Features],
     learned: _Learned | None,
     known: KnownCameras,
-    focal: FocalPlan,
+    plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
 ) -> _Model:
-    """Everything from features to a finished mapping; learned matches of pairs join those of the descriptors."""
+    """Everything from features to a finished mapping; learned matches of pairs join those of the descriptors.
+
+    Where the pictures show that the lens bends them, keypoints are straightened and all is done again.
+    """
+    model = _solved(features, None, learned, known, plan, config, setup)
+    for _ in range(config.distortion_rounds if plan.refine and not known.posed.any() else 0):
+        found = find_distortion(model.mapping, model.distortion)
+        if found is None:
+            break
+        straight = [replace(own, pixel_xy=found.undistorted(view, own.pixel_xy)) for view, own in enumerate(features)]
+        ratio = float(found.intrinsics[plan.main, 0, 0] / plan.units_px[plan.main, 0])
+        narrowed = replace(plan, starts=(replace(plan.starts[0], ratio=ratio),))
+        model = _solved(straight, found, learned, known, narrowed, config, setup)
+    return model
+
+
+def _solved(
+    features: list[Features],
+    distortion: Distortion | None,
+    learned: _Learned | None,
+    known: KnownCameras,
+    plan: LensPlan,
+    config: SfmConfig,
+    setup: Setup,
+) -> _Model:
+    """From keypoints of pinhole cameras (made so by ``distortion``) to a finished mapping."""
     views = len(features)
     pairs = [
         match_and_verify(
@@ -180,16 +224,23 @@ def _model(
         for a in range(views)
         for b in range(a + 1, views)
     ]
-    found = _pair_kinds(features, pairs, focal, config, setup, frozenset() if learned is None else learned.turns)
-    mapping, source = _map(build_tracks(features, pairs), features, pairs, found, known, focal, config, setup)
-    return _Model(features=features, pairs=pairs, kinds=found.kinds, mapping=mapping, focal_source=source)
+    found = _pair_kinds(features, pairs, plan, config, setup, frozenset() if learned is None else learned.turns)
+    mapping, source = _map(build_tracks(features, pairs), features, pairs, found, known, plan, config, setup)
+    return _Model(
+        features=features,
+        pairs=pairs,
+        kinds=found.kinds,
+        mapping=mapping,
+        focal_source=source,
+        distortion=distortion,
+    )
 
 
 def _learned_models(
     model: _Model,
     leading: Sequence[bool],
     known: KnownCameras,
-    focal: FocalPlan,
+    plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
 ) -> list[_Model]:
@@ -210,7 +261,7 @@ def _learned_models(
         if kind is PairKind.ROTATION and pair.verified.count >= _SURE_OF_A_TURN
     )
     return [
-        _model(features, _Learned(matches=matches, lead=lead, turns=turns), known, focal, config, setup)
+        _model(features, _Learned(matches=matches, lead=lead, turns=turns), known, plan, config, setup)
         for lead in leading
     ]
 
@@ -244,7 +295,7 @@ class _PairKinds:
 def _pair_kinds(
     features: list[Features],
     pairs: list[PairMatches],
-    focal: FocalPlan,
+    plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
     turns: frozenset[tuple[int, int]],
@@ -258,7 +309,7 @@ def _pair_kinds(
     kinds, factors = [], []
     rng = np.random.default_rng(setup.seed)
     low, high = config.focal_bounds
-    unit_factor = setup.long_side / focal.nominal[0, 0, 0]
+    unit_factor = float(plan.units_px[0, 0] / plan.nominal[0, 0, 0])
     bounds = (low * unit_factor, high * unit_factor)
     threshold = config.rotation_px * setup.unit_px
 
@@ -267,8 +318,8 @@ def _pair_kinds(
         _, inlier = fit_rotation(
             features[pair.view_a].pixel_xy[pair.verified.index_a],
             features[pair.view_b].pixel_xy[pair.verified.index_b],
-            scaled_focal(focal.nominal[pair.view_a], factor),
-            scaled_focal(focal.nominal[pair.view_b], factor),
+            scaled_focal(plan.nominal[pair.view_a], factor),
+            scaled_focal(plan.nominal[pair.view_b], factor),
             threshold_px=threshold,
             rng=rng,
         )
@@ -281,9 +332,9 @@ def _pair_kinds(
             continue
         factor = 1.0
         rotation_only = share(pair, factor) >= config.rotation_share
-        if not rotation_only and focal.source is None:
+        if not rotation_only and plan.source is None:
             xy_a, xy_b = features[a].pixel_xy[matches.index_a], features[b].pixel_xy[matches.index_b]
-            found = rotation_focal(xy_a, xy_b, focal.nominal[a], bounds, threshold_px=threshold, seed=setup.seed)
+            found = rotation_focal(xy_a, xy_b, plan.nominal[a], bounds, threshold_px=threshold, seed=setup.seed)
             if found is not None and share(pair, found) >= config.rotation_share_free_focal:
                 factor, rotation_only = found, True
             elif (a, b) in turns and found is not None:
@@ -301,71 +352,131 @@ def _map(
     pairs: list[PairMatches],
     found: _PairKinds,
     known: KnownCameras,
-    focal: FocalPlan,
+    plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
 ) -> tuple[Mapping, FocalSource]:
-    """The best model over all focal starts and initial pairs, finished; and where its focal came from."""
-    enough = len(setup.greys) >= config.min_views_for_focal or focal.source is not None
+    """The best model over all focal starts and initial pairs, finished; and where its main focal came from."""
+    enough = len(setup.greys) >= config.min_views_for_focal
     few = tracks.longest(config.sweep_tracks)
 
-    def grown(start: np.ndarray, pair: PairMatches | None) -> Mapping | None:
-        candidate = _new_mapping(few, start, focal, config, setup)
+    def grown(start: FocalStart, pair: PairMatches | None) -> Mapping | None:
+        candidate = _new_mapping(few, start, plan, config, setup)
         if pair is None:
             _set_known_poses(candidate, known)
         elif not _set_initial_pair(candidate, features, pair, config):
             return None
-        candidate.grow(refine_focal=focal.refine and enough, free=_free_views(candidate, known, config))
+        refine = plan.refine and (enough or start.source is not None)
+        candidate.grow(refine_focal=refine, free=_free_views(candidate, known, config))
         return candidate
 
     initial: list[PairMatches | None] = [None]
     if not known.posed.any():
-        initial = _initial_pairs(features, pairs, found.kinds, focal.nominal, config, setup)
-    best: Mapping | None = None
+        initial = _initial_pairs(features, pairs, found.kinds, plan, config, setup)
+    best: tuple[float, Mapping, FocalStart] | None = None
     for position, pair in enumerate(initial):
-        # The first pair finds the focal; further pairs only have to beat it there.
-        starts = focal.starts if position == 0 or best is None else (best.start_intrinsics,)
-        for candidate in (grown(start, pair) for start in starts):
-            if candidate is not None and (best is None or candidate.score() > best.score()):
-                best = candidate
-    if best is None or not best.valid.any():
+        # The first pair finds the focal; further pairs only have to beat it there. Unless the first one leaves much unexplained:
+        # then one of its views may have another lens than the rest, and its focal says nothing.
+        doubtful = best is None or best[0] < config.focal_doubt_share * few.seen.sum()
+        starts = plan.starts if position == 0 or doubtful or best is None else (best[2],)
+        for start in starts:
+            candidate = grown(start, pair)
+            if candidate is not None and (best is None or candidate.score() > best[0]):
+                best = candidate.score(), candidate, start
+    if best is None or not best[1].valid.any():
         turning = 1.0 if found.turning_focal is None else found.turning_focal
-        start = np.stack([scaled_focal(intrinsics, turning) for intrinsics in focal.nominal])
-        empty = _new_mapping(tracks, start, focal, config, setup)
+        start = replace(plan.starts[0], ratio=turning * (plan.starts[0].ratio if plan.source else config.focal_prior))
+        empty = _new_mapping(tracks, start, plan, config, setup)
         _set_known_poses(empty, known)
-        return empty, focal.source or (FocalSource.ASSUMED if turning == 1 else FocalSource.TURNED)
-    best = _on_all_tracks(best, tracks, focal, config, setup)
-    free = _free_views(best, known, config)
-    best.grow(refine_focal=False, free=free)
-    attempted = focal.refine and (focal.source is not None or int(best.registered.sum()) >= config.min_views_for_focal)
-    refine = _finish(best, attempted, free, config)
+        return empty, plan.source or (FocalSource.ASSUMED if turning == 1 else FocalSource.TURNED)
+    _, model, start = best
+    _log.debug(
+        "started from a focal of %.2f, found %.3f", start.ratio, start.ratio * np.exp(model.log_focal[plan.main])
+    )
+    model = _on_all_tracks(model, tracks, start, plan, config, setup)
+    free = _free_views(model, known, config)
+    model.grow(refine_focal=False, free=free)
+    several = int(model.registered.sum()) >= config.min_views_for_focal
+    attempted = plan.refine and (start.source is not None or several)
+    refine = _finish(model, attempted, free, plan, config)
+    # Before matches are found again in epipolar bands: those of a wrong camera would only bring matches that agree with it.
+    for _ in range(config.lens_rounds if refine else 0):
+        freer = model.copy()
+        if not settle_lenses(freer, features, pairs):
+            break
+        freer.grow(refine_focal=True, free=free)
+        refined = _finish(freer, refine, free, plan, config)
+        _log.debug("other lenses: score %.1f -> %.1f", model.score(), freer.score())
+        if freer.score() <= model.score():
+            break
+        model, refine = freer, refined
     if config.guided:
-        again = build_tracks(features, _guided_pairs(best, features, pairs, config))
-        best = _on_all_tracks(best, again, focal, config, setup)
-        best.grow(refine_focal=False, free=_free_views(best, known, config))
-        refine = _finish(best, refine, free, config)
+        again = build_tracks(features, _guided_pairs(model, features, pairs, config))
+        model = _on_all_tracks(model, again, start, plan, config, setup)
+        model.grow(refine_focal=False, free=_free_views(model, known, config))
+        refine = _finish(model, refine, free, plan, config)
+    _log.debug("direction sigma\n%s", model.direction_sigma_deg().round(2))
     if refine:
-        return best, FocalSource.REFINED
-    return best, focal.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)
+        return model, FocalSource.REFINED
+    return model, start.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)
 
 
-def _new_mapping(tracks: Tracks, intrinsics: np.ndarray, focal: FocalPlan, config: SfmConfig, setup: Setup) -> Mapping:
-    """An empty model with start intrinsics, bounds and prior of the focal relative to them."""
-    mapping = Mapping(tracks, intrinsics, config, unit_px=setup.unit_px, seed=setup.seed)
-    ratio = float(intrinsics[0, 0, 0]) / setup.long_side
+def _new_mapping(tracks: Tracks, start: FocalStart, plan: LensPlan, config: SfmConfig, setup: Setup) -> Mapping:
+    """An empty model with start intrinsics, and bounds and priors of the focals relative to them."""
+    intrinsics = plan.intrinsics(start.ratio)
+    views = len(plan.lens_of)
+    lenses = Lenses.nominal(views)
+    sigma = np.full(lenses.values.shape, np.inf)
+    ratios = intrinsics[:, 0, 0] / plan.units_px[:, 0]
     low, high = config.focal_bounds
     # A given focal outside the bounds is believed, and stays where it is.
-    mapping.log_focal_bounds = (min(np.log(low / ratio), 0.0), max(np.log(high / ratio), 0.0))
-    mapping.log_focal_prior = (float(np.log(focal.prior / ratio)), focal.sigma)
-    return mapping
+    lenses.low[:, LOG_FOCAL] = np.minimum(np.log(low / ratios), 0.0)
+    lenses.high[:, LOG_FOCAL] = np.maximum(np.log(high / ratios), 0.0)
+    lenses.free[:, LOG_FOCAL] = True
+    guesses: dict[int, tuple[float, ...]] = {}
+    crops: dict[int, CropOfMain] = {}
+    for view in range(views):
+        lens = plan.lens_of[view]
+        if plan.known is not None or lens == plan.main:
+            lenses.prior[view, LOG_FOCAL] = np.log(start.prior / start.ratio)
+            sigma[view, LOG_FOCAL] = start.sigma
+            continue
+        likely = plan.guesses(view, start.ratio)
+        guesses[view] = tuple(float(np.log(other / likely[0])) for other in likely[1:])
+        limits = plan.crop_of_main(view)
+        if limits is not None:
+            crops[view] = CropOfMain(log_focal=guesses[view][-1], limit_x=limits[0], limit_y=limits[1])
+        hinted = bool(np.isfinite(plan.focal_hints[lens])) and start.source is not None
+        sigma[view, LOG_FOCAL] = config.focal_hint_sigma if hinted else config.split_focal_sigma
+        if plan.generated[view]:
+            sigma[view, LOG_FOCAL] = config.generated_focal_sigma
+    return Mapping(
+        tracks,
+        intrinsics,
+        config,
+        unit_px=setup.unit_px,
+        seed=setup.seed,
+        lens_of=plan.lens_of,
+        shift_unit_px=plan.units_px,
+        lenses=lenses,
+        prior_sigma=sigma,
+        guesses=guesses,
+        crops=crops,
+        main=plan.main,
+        penalty=start.penalty,
+    )
 
 
-def _finish(mapping: Mapping, refine: bool, free: np.ndarray | None, config: SfmConfig) -> bool:
-    """Finish a model; a focal that turns out too uncertain falls back to its prior. Returns whether it was refined."""
+def _finish(mapping: Mapping, refine: bool, free: np.ndarray | None, plan: LensPlan, config: SfmConfig) -> bool:
+    """Finish a model; a main focal that turns out too uncertain falls back to its prior. Returns whether it was refined."""
     mapping.finish(refine_focal=refine, free=free)
-    if refine and mapping.focal_sigma > config.max_focal_sigma:
-        _log.info("focal is uncertain (sigma of its logarithm %.2f): the prior is kept", mapping.focal_sigma)
-        mapping.log_focal = mapping.log_focal_prior[0]
+    main = mapping.lens_of[plan.main]
+    if refine and mapping.lens_sigma[main, LOG_FOCAL] > config.max_focal_sigma:
+        uncertain = float(mapping.lens_sigma[main, LOG_FOCAL])
+        _log.info("focal is uncertain (sigma of its logarithm %.2f): the prior is kept", uncertain)
+        values = mapping.lenses.values.copy()
+        values[main, LOG_FOCAL] = mapping.lenses.prior[main, LOG_FOCAL]
+        mapping.lenses = replace(mapping.lenses, values=values)
         mapping.finish(refine_focal=False, free=free)
         return False
     return refine
@@ -390,9 +501,11 @@ def _guided_pairs(
     return found
 
 
-def _on_all_tracks(model: Mapping, tracks: Tracks, focal: FocalPlan, config: SfmConfig, setup: Setup) -> Mapping:
+def _on_all_tracks(
+    model: Mapping, tracks: Tracks, start: FocalStart, plan: LensPlan, config: SfmConfig, setup: Setup
+) -> Mapping:
     """The same cameras over all tracks."""
-    full = _new_mapping(tracks, model.start_intrinsics, focal, config, setup)
+    full = _new_mapping(tracks, start, plan, config, setup)
     full.adopt(model)
     return full
 
@@ -419,12 +532,15 @@ def _initial_pairs(
     features: list[Features],
     pairs: list[PairMatches],
     kinds: list[PairKind],
-    intrinsics: np.ndarray,
+    plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
 ) -> list[PairMatches | None]:
-    """The most promising pairs to begin with: inliers x triangulation angle, capped."""
-    scored: list[tuple[float, PairMatches]] = []
+    """The most promising pairs to begin with: inliers x triangulation angle, capped; of the main lens where there are such.
+
+    No view is in all of them where that can be: one view with another lens than it seems to have must not spoil every start.
+    """
+    scored: list[tuple[bool, float, PairMatches]] = []
     for pair, kind in zip(pairs, kinds, strict=True):
         if kind is not PairKind.PARALLAX:
             continue
@@ -432,15 +548,22 @@ def _initial_pairs(
         pose = relative_pose(
             features[a].pixel_xy[pair.verified.index_a],
             features[b].pixel_xy[pair.verified.index_b],
-            intrinsics[a],
-            intrinsics[b],
+            plan.nominal[a],
+            plan.nominal[b],
             threshold_px=config.epipolar_px * setup.unit_px,
             seed=setup.seed,
         )
         if pose is not None and pose.angle_deg > config.min_angle_deg:
-            scored.append((float(pose.inlier.sum()) * min(pose.angle_deg, config.max_initial_angle_deg), pair))
-    scored.sort(key=lambda entry: -entry[0])
-    return [pair for _, pair in scored[: config.initial_pairs]]
+            alike = plan.lens_of[a] == plan.lens_of[b] == plan.main
+            value = float(pose.inlier.sum()) * min(pose.angle_deg, config.max_initial_angle_deg)
+            scored.append((alike, value, pair))
+    scored.sort(key=lambda entry: (not entry[0], -entry[1]))
+    ranked = [pair for _, _, pair in scored]
+    chosen = ranked[: config.initial_pairs]
+    for view in (chosen[0].view_a, chosen[0].view_b) if chosen else ():
+        if all(view in (pair.view_a, pair.view_b) for pair in chosen):
+            chosen += [pair for pair in ranked if view not in (pair.view_a, pair.view_b)][:1]
+    return list(chosen)
 
 
 def _set_initial_pair(mapping: Mapping, features: list[Features], pair: PairMatches, config: SfmConfig) -> bool:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from sceneexpander.frontend.bundle import LOG_FOCAL
+from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.placement import Placement
@@ -22,6 +24,8 @@ def build_reconstruction(
     focal_source: FocalSource,
     names: Sequence[str],
     scale_xy: np.ndarray,
+    *,
+    distortion: Distortion | None = None,
 ) -> SparseReconstruction:
     """Change frame, scale and pixels; write the report.
 
@@ -33,6 +37,7 @@ def build_reconstruction(
         focal_source: for the report.
         names: of the views.
         scale_xy: pixels of the given images per pixel of the feature images.
+        distortion: what the features' pixels were straightened by.
     """
     world_from_cam, points, scale = _normalised(mapping)
     rows, views = np.nonzero(mapping.active & mapping.registered)
@@ -55,9 +60,9 @@ def build_reconstruction(
         views=tuple(_view_report(v, names[v], mapping, placed.get(v), features, errors) for v in range(len(names))),
         pairs=pairs,
         focal_px=float(intrinsics[0, 0, 0]),
-        focal_ratio=float(mapping.intrinsics[0, 0, 0]) / (mapping.unit_px * 768),
+        focal_ratio=float(mapping.intrinsics[0, 0, 0] / mapping.shift_unit_px[0, 0]),
         focal_source=focal_source,
-        focal_sigma=float(mapping.focal_sigma),
+        focal_sigma=float(mapping.lens_sigma[mapping.lens_of[0], LOG_FOCAL]),
         points=len(used),
         median_angle_deg=float(np.median(angles)) if len(used) else float("nan"),
         mean_error_px=float(np.nanmean(errors)) if len(rows) else float("nan"),
@@ -69,6 +74,7 @@ def build_reconstruction(
         intrinsics_px=torch.from_numpy(intrinsics.astype(np.float32)),
         posed=torch.from_numpy(posed),
         sparse=sparse,
+        distortion=None if distortion is None else distortion.scaled(scale_xy),
         report=report,
     )
 

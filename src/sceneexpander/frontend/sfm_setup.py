@@ -1,4 +1,4 @@
-"""What the sparse front-end is given, checked and in the form its steps need: grey images, known cameras, focals to try."""
+"""What the sparse front-end is given, checked and in the form its steps need: grey images and known cameras."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sceneexpander.errors import UserError
 from sceneexpander.frontend.features import grey_u8
-from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, FocalSource, SfmConfig
+from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, SfmConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,57 +108,3 @@ def known_cameras(setup: Setup, intrinsics_px: Tensor | None, world_from_cam: Te
             cam_from_world[view, :3, :3] = (u @ vt).T
             cam_from_world[view, :3, 3] = -(u @ vt).T @ given[view, :3, 3]
     return KnownCameras(intrinsics=intrinsics, cam_from_world=cam_from_world, posed=posed)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FocalPlan:
-    """Start intrinsics to try, and how tightly the focal is tied to its prior."""
-
-    starts: tuple[np.ndarray, ...]  # each (view, 3, 3)
-    nominal: np.ndarray  # (view, 3, 3): for decisions that any plausible focal serves
-    prior: float  # focal over long side
-    sigma: float
-    source: FocalSource | None  # set when nothing is to be estimated or hinted
-    refine: bool
-
-    @classmethod
-    def make(cls, config: SfmConfig, setup: Setup, known: KnownCameras, focal_hint_px: float | None) -> FocalPlan:
-        """Known intrinsics, else the hint, else the sweep."""
-        views = len(setup.greys)
-        if known.intrinsics is not None:
-            ratio = float(known.intrinsics[0, 0, 0]) / setup.long_side
-            return cls(
-                starts=(known.intrinsics,),
-                nominal=known.intrinsics,
-                prior=ratio,
-                sigma=config.focal_hint_sigma,
-                source=FocalSource.KNOWN,
-                refine=config.refine_known_intrinsics,
-            )
-
-        def intrinsics(ratio: float) -> np.ndarray:
-            height, width = setup.size
-            focal = ratio * setup.long_side
-            return np.tile(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), (views, 1, 1))
-
-        if focal_hint_px is not None:
-            if not np.isfinite(focal_hint_px) or focal_hint_px <= 0:
-                raise UserError(f"is {focal_hint_px}", where="focal hint", fix="give pixels > 0, or none")
-            ratio = focal_hint_px / float(setup.scale_xy[0]) / setup.long_side
-            start = intrinsics(ratio)
-            return cls(
-                starts=(start,),
-                nominal=start,
-                prior=ratio,
-                sigma=config.focal_hint_sigma,
-                source=FocalSource.HINT,
-                refine=True,
-            )
-        return cls(
-            starts=tuple(intrinsics(ratio) for ratio in config.focal_starts),
-            nominal=intrinsics(config.focal_prior),
-            prior=config.focal_prior,
-            sigma=config.focal_prior_sigma,
-            source=None,
-            refine=True,
-        )

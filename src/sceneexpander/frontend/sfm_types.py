@@ -8,6 +8,7 @@ from enum import StrEnum
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.sparse_points import SparsePoints
 
 REFERENCE_LONG_SIDE_PX = 768  # every `_px` threshold below is for images of this long side, and scales with it
@@ -62,14 +63,25 @@ class SfmConfig:
     rotation_share_free_focal: float = 0.9  # the same at the focal that suits the pair best
     rotation_px: float = 2.5
 
-    # Focal length, in units of the long side.
-    focal_starts: tuple[float, ...] = (0.6, 0.75, 0.9, 1.1, 1.3)
-    focal_bounds: tuple[float, float] = (0.45, 1.6)
+    # Focal length, in units of the original's long side.
+    focal_starts: tuple[float, ...] = (0.35, 0.48, 0.62, 0.78, 0.98, 1.25, 1.7, 2.5)
+    focal_bounds: tuple[float, float] = (0.3, 4.0)  # ultra-wide and tele lenses of phones are .36 and 3.3
     focal_prior: float = 0.85  # phones .7-.75, 35-50 mm lenses 1-1.4, wide lenses .5-.6
     focal_prior_sigma: float = 0.25  # of the logarithm
     focal_hint_sigma: float = 0.05  # of the logarithm, around a focal from EXIF
+    focal_hint_penalty: float = 60.0  # observations that another focal must explain beyond those that EXIF's does
+    generated_focal_sigma: float = 0.1  # of the logarithm: a generated picture's focal around that of the photos
     min_views_for_focal: int = 4  # with fewer views the focal is chosen among the starts and then fixed
     max_focal_sigma: float = 0.15  # of the logarithm: a focal less certain than this is fixed at its prior
+    focal_doubt_share: float = 0.7  # a view whose lens explains less of the points that it sees is tried with others
+    split_cost: float = 0.7  # a lens of its own must leave at most this share of what the shared one leaves unexplained
+    focal_step: float = 1.2  # between the focals tried for one view
+    split_focal_sigma: float = 0.5  # of the logarithm, around the lens that a view was split from
+    crop_cost: float = 0.85  # the same for a part cut out of a picture of the shared lens: fewer numbers are free
+    lens_rounds: int = 3  # times that lenses are tested and the model is finished again
+    split_penalty: float = 20.0  # observations that a split must bring
+
+    distortion_rounds: int = 2  # times that radial distortion is looked for and keypoints are straightened; 0: never
 
     # Reconstruction.
     initial_pairs: int = 2  # tried per focal start
@@ -177,10 +189,12 @@ class SparseReconstruction:
 
     World frame: camera frame of view 0. Scale: the median depth of the points seen by view 0 is 1 (over all views if view 0
     sees none; untouched if there are no points). Poses of views with ``posed`` False are placeholders.
+    Intrinsics and points' pixels are those of pinhole cameras: of the given pictures after ``distortion.straightened``.
     """
 
     world_from_cam: Float[Tensor, "view 4 4"]
     intrinsics_px: Float[Tensor, "view 3 3"]
     posed: Bool[Tensor, "view"]
     sparse: SparsePoints
+    distortion: Distortion | None  # in the given pixels; None if the pictures show none
     report: SfmReport

@@ -19,7 +19,7 @@ from sceneexpander.frontend.matching import Matches, guided_matches, mutual_matc
 from sceneexpander.frontend.sfm_types import SfmConfig
 
 _log = logging.getLogger(__name__)
-_ITERATIONS = 4000
+MOST_SAMPLES = 4000  # of a robust fit
 _CONFIDENCE = 0.9999
 _NEAR_LEADING = 4.0  # descriptor matches this many noise scales from the learned geometry may still refine it
 
@@ -45,12 +45,12 @@ class RelativePose:
     angle_deg: float  # median triangulation angle of the inliers
 
 
-def usac_parameters(threshold: float, seed: int) -> cv2.UsacParams:
+def usac_parameters(threshold: float, seed: int, samples: int = MOST_SAMPLES) -> cv2.UsacParams:
     """Single-threaded MAGSAC with its own random state, so that equal inputs give equal results."""
     parameters = cv2.UsacParams()
     parameters.threshold = threshold
     parameters.confidence = _CONFIDENCE
-    parameters.maxIterations = _ITERATIONS
+    parameters.maxIterations = samples
     parameters.sampler = cv2.SAMPLING_UNIFORM
     parameters.score = cv2.SCORE_METHOD_MAGSAC
     parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sceneexpander.frontend.bundle import BundleProblem, rotation_exp
+from sceneexpander.frontend.bundle import BundleProblem, Lenses, rotation_exp
 from sceneexpander.frontend.tracks import Tracks
 
 
@@ -65,7 +65,11 @@ def bundle_problem(world: PointWorld, **changes: object) -> BundleProblem:
     rows, columns = np.nonzero(np.ones((points, views), bool))
     free = np.ones(views, bool)
     free[0] = False
+    views = len(world.rotations)
     problem = BundleProblem(
+        lens_index=np.zeros(views, np.int64),
+        lenses=Lenses.nominal(1),
+        shift_unit_px=np.full((views, 2), 768.0),
         rotations=world.rotations,
         translations=world.translations,
         focals_px=world.intrinsics[:, [0, 1], [0, 1]],
@@ -77,6 +81,17 @@ def bundle_problem(world: PointWorld, **changes: object) -> BundleProblem:
         camera_free=free,
     )
     return replace(problem, **changes)
+
+
+def with_lens(problem: BundleProblem, lens: int = 0, **tables: dict[int, float]) -> BundleProblem:
+    """The problem with single entries of its lens tables changed: ``free={K1: True}``, ``values={LOG_FOCAL: 0.1}``, ..."""
+    changed = {}
+    for table, entries in tables.items():
+        array = getattr(problem.lenses, table).copy()
+        for column, value in entries.items():
+            array[lens, column] = value
+        changed[table] = array
+    return replace(problem, lenses=replace(problem.lenses, **changed))
 
 
 def perturbed(problem: BundleProblem, seed: int, *, angle: float, shift: float, spread: float) -> BundleProblem:

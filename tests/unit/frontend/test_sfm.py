@@ -9,7 +9,9 @@ import sfm_worlds as worlds
 import torch
 
 from sceneexpander.errors import UserError
-from sceneexpander.frontend.mapping import Mapping, solve_pose
+from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
+from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.resection import solve_pose
 from sceneexpander.frontend.sfm import SfmConfig, estimate_cameras
 from sceneexpander.frontend.sfm_types import FocalSource, PairKind, SparseReconstruction
 from sceneexpander.frontend.tracks import Tracks
@@ -54,7 +56,9 @@ def pose_errors_deg(found: SparseReconstruction, truth: torch.Tensor) -> tuple[t
 def grown(world: worlds.PointWorld, tracks: Tracks, *, focal_factor: float, refine: bool) -> Mapping:
     intrinsics = world.intrinsics.copy()
     intrinsics[:, [0, 1], [0, 1]] *= focal_factor
-    mapping = Mapping(tracks, intrinsics, SfmConfig(), unit_px=1.0, seed=1)
+    lenses = Lenses.nominal(len(intrinsics))
+    lenses.free[:, LOG_FOCAL] = True
+    mapping = Mapping(tracks, intrinsics, SfmConfig(), unit_px=1.0, seed=1, lenses=lenses)
     both = np.flatnonzero(tracks.seen[:, 0] & tracks.seen[:, 3])
     pose = relative_pose(
         tracks.pixel_xy[both, 0], tracks.pixel_xy[both, 3], intrinsics[0], intrinsics[3], threshold_px=1.5, seed=1
@@ -72,7 +76,7 @@ def test_mapping_recovers_cameras_and_a_wrong_focal(focal_factor: float) -> None
     mapping = grown(world, world.tracks, focal_factor=focal_factor, refine=True)
     assert mapping.registered.all()
     # Exact pixels, no prior: only the stopping of the iteration is left.
-    assert np.exp(mapping.log_focal) * focal_factor == pytest.approx(1.0, abs=5e-3)
+    assert np.exp(mapping.log_focal[0]) * focal_factor == pytest.approx(1.0, abs=5e-3)
     turn, direction = worlds.pose_errors_deg(mapping.rotations, mapping.translations, world)
     assert turn.max() < 0.05
     assert direction.max() < 0.2
@@ -322,7 +326,7 @@ def test_bad_arguments_are_refused(scene: scenes.Scene) -> None:
     with pytest.raises(ValueError, match="focal_bounds"):
         SfmConfig(focal_bounds=(1.0, 0.5))
     with pytest.raises(ValueError, match="focal_starts"):
-        SfmConfig(focal_starts=(3.0,))
+        SfmConfig(focal_starts=(0.9, 5.0))
 
 
 def test_a_wrong_match_that_only_two_views_see_is_dropped_before_export() -> None:

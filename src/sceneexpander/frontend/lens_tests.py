@@ -1,0 +1,261 @@
+"""Whether the lenses of a finished model are what they were taken for: focal alone and together, principal point, distortion.
+
+Each test lets something go free that was held, and keeps it only where much less is left unexplained and the value is far from what it
+was held at. Ordinary photos keep the simple camera.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sceneexpander.frontend.bundle import K1, K2, LOG_FOCAL, SHIFT_X, SHIFT_Y, BundleResult
+from sceneexpander.frontend.distortion import Distortion
+from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, LensFreedom, OtherView, freedom_of, held_lens
+from sceneexpander.frontend.features import Features
+from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.resection import rough_poses
+from sceneexpander.frontend.twoview import PairMatches
+
+_log = logging.getLogger(__name__)
+
+_MIN_MATCHES = 60  # of a view with all others: fewer say too little about its lens
+_NOISE_PX = 0.5  # at 768 px: of matches, for their distance from epipolar lines
+_STANDS_OUT = 1.25  # times the usual share of what stays unexplained
+_KEEP_BEST = 4  # poses at other focals that are refined
+_OWN_FOCAL = 0.04  # of the logarithm: nearer to the shared focal than this nothing is gained by another
+_OWN_SHIFT = 0.03  # of the long side: principal points of whole photos are within a hundredth or two of the centre
+_MAX_SHIFT = 0.5  # a crop that keeps a corner of a quarter of the area moves the centre by half
+_SHIFT_SIGMA = 0.2  # prior of a cropped picture's principal point
+_K_SIGMA = (0.3, 0.3)  # priors of k1 and k2; wide action cameras have k1 near -.3
+_MIN_BEND_PX = 1.0  # at 768 px: distortion that moves the outermost points less than this is left alone
+_GAIN = 60.0  # of log-likelihood, by which a freer lens must explain a whole model better: eight correlated errors count as one
+
+
+def settle_lenses(mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches]) -> bool:
+    """Find lenses that are not what they were taken for and correct them in place. Returns whether anything changed.
+
+    First the one view that gains most from a lens of its own (zoomed, cropped): with its camera wrong, the others' are not beyond doubt.
+    Without such a view whole lenses (all photos cropped alike). Call it again once the model is finished anew.
+    """
+    if mapping.registered.sum() < 3:
+        return False
+    seen = {int(view): _other_views(mapping, int(view), features, pairs) for view in np.flatnonzero(mapping.registered)}
+    checks = [
+        _LensCheck(mapping, view, others)
+        for view, others in seen.items()
+        if sum(len(other.own_xy) for other in others) >= _MIN_MATCHES
+    ]
+    if not checks:
+        return False
+    usual = float(np.median([check.now.cost for check in checks]))
+    # All matches of one odd view are wrong, a part of those of every other one: it stands out.
+    for check in sorted(checks, key=lambda check: -check.now.cost):
+        found = check.alternative(thorough=check.alone or check.now.cost > _STANDS_OUT * usual)
+        if found is not None:
+            check.adopt(found)
+            return True
+    for lens in np.unique(mapping.lens_of[mapping.registered]):
+        if (mapping.registered & (mapping.lens_of == lens)).sum() >= 3 and _free_shift(mapping, int(lens)):
+            return True
+    return False
+
+
+class _LensCheck:
+    """One view's matches with the other posed views, and other lenses that explain them better."""
+
+    def __init__(self, mapping: Mapping, view: int, others: Sequence[OtherView]) -> None:
+        self.mapping, self.view = mapping, view
+        self.alone = int((mapping.lens_of == mapping.lens_of[view]).sum()) == 1
+        self.fit = EpipolarFit(
+            others,
+            mapping.start_intrinsics[view],
+            mapping.shift_unit_px[view],
+            noise_px=_NOISE_PX * mapping.unit_px,
+        )
+        lens = mapping.lenses.resolved[mapping.lens_of[view]]
+        self.now = self.fit.refine(mapping.rotations[view], mapping.translations[view], lens, held_lens())
+
+    def alternative(self, *, thorough: bool) -> EpipolarView | None:
+        """A lens that leaves much less unexplained; None if there is none.
+
+        Args:
+            thorough: begin from many focals, not only from the present one.
+        """
+        mapping, view, now = self.mapping, self.view, self.now
+        row = mapping.lens_of[view]
+        focal = {
+            LOG_FOCAL: (float(mapping.lenses.low[row, LOG_FOCAL]), float(mapping.lenses.high[row, LOG_FOCAL]), np.inf)
+        }
+        starts = [now, *(self._rough_poses() if thorough else [])]
+        zoomed = self._best(starts, freedom_of(focal, now.lens))
+        crop = mapping.crops.get(view)
+        candidates = [zoomed] if abs(zoomed.lens[LOG_FOCAL] - now.lens[LOG_FOCAL]) > _OWN_FOCAL else []
+        cropped: EpipolarView | None = None
+        if crop is not None:
+            # A part cut out of a picture of the main lens: its focal is known, its centre lies within what could be cut off.
+            cut = zoomed.lens.copy()
+            cut[LOG_FOCAL] = crop.log_focal + mapping.log_focal[mapping.main]
+            shift = {
+                SHIFT_X: (-crop.limit_x, crop.limit_x, np.inf),
+                SHIFT_Y: (-crop.limit_y, crop.limit_y, np.inf),
+            }
+            begin = [replace(start, lens=cut) for start in (*starts, zoomed)]
+            cropped = self._best(begin, freedom_of(shift, cut))
+            if np.abs(cropped.lens[SHIFT_X : SHIFT_Y + 1]).max() > _OWN_SHIFT:
+                candidates.insert(0, cropped)
+        if thorough:
+            anywhere = {**focal, **dict.fromkeys((SHIFT_X, SHIFT_Y), (-_MAX_SHIFT, _MAX_SHIFT, _SHIFT_SIGMA))}
+            free = self._best([zoomed], freedom_of(anywhere, np.zeros_like(now.lens)))
+            if np.abs(free.lens[SHIFT_X : SHIFT_Y + 1]).max() > _OWN_SHIFT:
+                candidates.append(free)
+        _log.debug(
+            "view %d: %d matches, unexplained %.4f; others %s",
+            view,
+            self.fit.count,
+            now.cost,
+            [(round(c.cost, 4), c.lens[: SHIFT_Y + 1].round(3).tolist()) for c in candidates],
+        )
+        # Simplest first: each next one must explain much more than what is held so far. A crop frees two numbers and holds one.
+        best = now
+        for candidate in candidates:
+            share = mapping.config.crop_cost if candidate is cropped else mapping.config.split_cost
+            if candidate.cost < share * best.cost:
+                best = candidate
+        return None if best is now else best
+
+    def adopt(self, found: EpipolarView) -> None:
+        """Make the lens the view's own."""
+        mapping, view = self.mapping, self.view
+        if not self.alone:
+            mapping.split_lens(view)
+        mapping.set_lens(view, found.lens)
+        mapping.rotations[view], mapping.translations[view] = found.rotation, found.translation
+        if np.abs(found.lens[SHIFT_X : SHIFT_Y + 1]).max() > 0:
+            mapping.let_shift(view, _SHIFT_SIGMA)
+        crop = mapping.crops.get(view)
+        if crop is not None and found.lens[LOG_FOCAL] == crop.log_focal + mapping.log_focal[mapping.main]:
+            mapping.follow_focal(view, mapping.main, crop.log_focal)
+        # Points that the wrong camera has helped to make are made again.
+        with_it = mapping.valid & mapping.active[:, view]
+        mapping.active[:, view] = False
+        mapping.valid &= ~with_it | (mapping.active.sum(1) >= 2)
+        mapping.active &= mapping.valid[:, None]
+
+    def _best(self, starts: Sequence[EpipolarView], freedom: LensFreedom) -> EpipolarView:
+        found = [self.fit.refine(start.rotation, start.translation, start.lens, freedom) for start in starts]
+        return min(found, key=lambda view: view.cost)
+
+    def _rough_poses(self) -> list[EpipolarView]:
+        """Poses from the model's points at other focals."""
+        mapping, view = self.mapping, self.view
+        active = mapping.active.copy()
+        active[:, view] = False
+        rows = np.flatnonzero(
+            mapping.tracks.seen[:, view] & mapping.valid & ((active & mapping.registered).sum(1) >= 2)
+        )
+        rough = rough_poses(mapping.sighting(view, rows), mapping.log_focals_to_try(view, alone=True))
+        judged = [self.fit.judge(pose.rotation, pose.translation, pose.lens) for pose in rough]
+        return sorted(judged, key=lambda pose: pose.cost)[:_KEEP_BEST]
+
+
+def _other_views(
+    mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]
+) -> list[OtherView]:
+    """The other posed views with their verified matches with this one."""
+    found = []
+    for pair in pairs:
+        if view not in (pair.view_a, pair.view_b) or pair.verified.count == 0:
+            continue
+        first = pair.view_a == view
+        other = pair.view_b if first else pair.view_a
+        mine, theirs = (pair.verified.index_a, pair.verified.index_b)[:: 1 if first else -1]
+        if mapping.registered[other]:
+            found.append(
+                OtherView(
+                    rotation=mapping.rotations[other],
+                    translation=mapping.translations[other],
+                    intrinsics=mapping.intrinsics[other],
+                    own_xy=features[other].pixel_xy[theirs],
+                    view_xy=features[view].pixel_xy[mine],
+                )
+            )
+    return found
+
+
+def _free_shift(mapping: Mapping, lens: int) -> bool:
+    """Let the principal point of a lens of several views go where all of them want it."""
+    if mapping.lenses.free[lens, SHIFT_X]:
+        return False
+    free = mapping.lenses.free.copy()
+    free[lens, [LOG_FOCAL, SHIFT_X, SHIFT_Y]] = True
+    sigma = mapping.prior_sigma.copy()
+    sigma[lens, [SHIFT_X, SHIFT_Y]] = _SHIFT_SIGMA
+    held, freed = mapping.compare(mapping.lenses.free, mapping.prior_sigma), mapping.compare(free, sigma)
+    if held is None or freed is None:
+        return False
+    shift = freed.problem.lenses.values[lens, SHIFT_X : SHIFT_Y + 1]
+    _log.debug("lens %d: shift %s, gain %.1f", lens, shift.round(3), _gain(held, freed))
+    if np.abs(shift).max() < _OWN_SHIFT or _gain(held, freed) < _GAIN:
+        return False
+    mapping.lenses, mapping.prior_sigma = replace(mapping.lenses, free=free), sigma
+    mapping.take(freed)
+    return True
+
+
+def _gain(held: BundleResult, freed: BundleResult) -> float:
+    """By how much the logarithm of the likelihood rises (Cauchy, at the scale of the errors)."""
+    return (held.cost - freed.cost) / held.problem.robust_px**2
+
+
+def find_distortion(mapping: Mapping, before: Distortion | None) -> Distortion | None:
+    """Radial distortion of the model's photos, or None if the pictures show none.
+
+    Args:
+        mapping: finished over pixels that ``before`` has straightened.
+        before: what was taken out already; found anew together with the focals.
+    """
+    raw = mapping.tracks.pixel_xy
+    values = mapping.lenses.values.copy()
+    lenses = [
+        int(lens)
+        for lens in np.unique(mapping.lens_of[mapping.registered])
+        if (mapping.registered & (mapping.lens_of == lens)).sum() >= 2
+    ]
+    if mapping.registered.sum() < 3 or not lenses:
+        return None
+    if before is not None:
+        raw = before.distorted_tracks(raw)
+        for view in np.flatnonzero(mapping.registered):
+            values[mapping.lens_of[view], [K1, K2]] = before.coefficients_at(int(view), mapping.intrinsics[view])
+    free, sigma = mapping.lenses.free.copy(), mapping.prior_sigma.copy()
+    for lens in lenses:
+        free[lens, [K1, K2]] = True
+        sigma[lens, [K1, K2]] = _K_SIGMA
+    held = mapping.compare(mapping.lenses.free, mapping.prior_sigma)
+    freed = mapping.compare(free, sigma, pixel_xy=raw, values=values)
+    if held is None or freed is None:
+        return None
+    k = freed.problem.lenses.values[mapping.lens_of][:, [K1, K2]]
+    intrinsics = mapping.intrinsics_of(freed)
+    found = Distortion(intrinsics=intrinsics, k=k)
+    bend = _corner_bend_px(found, mapping, freed) / mapping.unit_px
+    _log.debug("distortion %s, moves corners %.2f px, gain %.1f", k[0].round(4), bend, _gain(held, freed))
+    if bend < _MIN_BEND_PX or (before is None and _gain(held, freed) < _GAIN):
+        return None
+    return found
+
+
+def _corner_bend_px(distortion: Distortion, mapping: Mapping, result: BundleResult) -> float:
+    """How far the outermost tenth of the observations is moved, at the view where that is most."""
+    most = 0.0
+    problem = result.problem
+    for view in np.flatnonzero(mapping.registered):
+        xy = problem.pixel_xy[problem.camera_index == view]
+        if len(xy):
+            moved = np.linalg.norm(distortion.undistorted(int(view), xy) - xy, axis=1)
+            most = max(most, float(np.quantile(moved, 0.95)))
+    return most
