@@ -10,9 +10,10 @@ thresholds 1..30 degrees of the share of pairs whose larger error is below (a pa
 
 ``--cases`` measures sets of unlike photos (`unlike_photos`) instead, as files through the door that users' photos come in by. Cameras are
 compared in the pixels of the files. A view's error is its median over the other views with a pose of the larger of rotation and direction;
-directions count between cameras at least 5 % of the widest distance apart. "sure" is posed and not loose. "silent wrong" are sure views
-without a remark, in a set without a remark, that are more than 2 degrees off or that no camera of the place took (the first view of a
-set without any other pose is only the origin). ``--known`` gives the true lenses: what is wrong then is not the focal's fault.
+directions count between cameras at least 5 % of the widest distance apart. "sure" is posed and not loose; "wrong" are sure views that are
+more than 2 degrees off or that no camera of the place took (the first view of a set without any other pose is only the origin), "silent"
+those of them about which nothing is said, neither of the view nor of the set. ``--known`` gives the true lenses: what is wrong then is
+not the focal's fault.
 """
 
 from __future__ import annotations
@@ -248,13 +249,18 @@ class CaseSet:
     cpu_s: float = 0.0
 
     @property
-    def silent_wrong(self) -> list[str]:
-        """Names of the views that are wrong and nothing says so."""
+    def wrong(self) -> list[str]:
+        """Names of the sure views that are wrong."""
         sure = [view for view in self.views if view.sure]
-        if self.notes or len(sure) < 2:
+        if len(sure) < 2:
             return []
-        quiet = [view for view in sure if not view.remark]
-        return [v.name for v in quiet if not v.true_camera or (v.error_deg is not None and v.error_deg > WRONG_DEG)]
+        return [v.name for v in sure if not v.true_camera or (v.error_deg is not None and v.error_deg > WRONG_DEG)]
+
+    @property
+    def silent_wrong(self) -> list[str]:
+        """Names of those about which nothing is said."""
+        said = {view.name for view in self.views if view.remark}
+        return [] if self.notes else [name for name in self.wrong if name not in said]
 
 
 def measure_case(case: str, seed: str, config: SfmConfig, *, known: bool) -> CaseSet:
@@ -344,8 +350,8 @@ def compare(
 
 
 CASE_HEADER = (
-    "| case | sets | sure of photos | rotation, deg | direction, deg | focal, % | said | silent wrong | CPU-s |\n"
-    "|---|---|---|---|---|---|---|---|---|"
+    "| case | sets | sure of photos | rotation, deg | direction, deg | focal, % | said | wrong | silent | CPU-s |\n"
+    "|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -371,6 +377,7 @@ def case_row(case: str, sets: Sequence[CaseSet]) -> str:
         spread([error for item in sets for error in item.direction_deg]),
         spread(focal),
         ", ".join(said) or "-",
+        str(sum(len(item.wrong) for item in sets)),
         str(sum(len(item.silent_wrong) for item in sets)),
         f"{statistics.fmean(item.cpu_s for item in sets):.1f}",
     ]
@@ -386,7 +393,8 @@ def show_set(item: CaseSet) -> None:
         if v.focal_error is not None:
             numbers += f" ({100 * np.expm1(v.focal_error):.1f} % off), centre {100 * (v.centre_error or 0):.1f} % off"
         error = "" if v.error_deg is None else f", {v.error_deg:.2f} deg"
-        mark = "  SILENT WRONG" if v.name in item.silent_wrong else ""
+        mark = "  WRONG" if v.name in item.wrong else ""
+        mark += ", SILENT" if v.name in item.silent_wrong else ""
         print(f"    {v.name} {state:5s} {numbers}{error}  {v.remark}{mark}")
     for note in (*item.notes, *item.door_notes):
         print(f"    note: {note}")
@@ -406,8 +414,8 @@ def run_cases(
                 show_set(sets[-1])
         print(case_row(name, sets), flush=True)
         every += sets
-    wrong = sum(len(item.silent_wrong) for item in every)
-    print(f"{len(every)} sets, {wrong} views silently wrong, {sum(i.cpu_s for i in every):.0f} CPU-s")
+    wrong, silent = sum(len(item.wrong) for item in every), sum(len(item.silent_wrong) for item in every)
+    print(f"{len(every)} sets, {wrong} views wrong, {silent} of them silently, {sum(i.cpu_s for i in every):.0f} CPU-s")
     return every
 
 
