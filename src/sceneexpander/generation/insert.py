@@ -113,7 +113,7 @@ def _assess(candidate: Candidate, views: ViewSet, frame: FrameSize, fit: Fit) ->
         # One bad candidate must not hide the others: it counts as refused, and only choosing it is an error.
         refusal = f"{error.problem}; {error.fix}" if error.fix else error.problem
         return _Assessed(name=candidate.name, provenance=replace(candidate.provenance, refusal=refusal))
-    fitted = fit_picture(picture.pixels, frame, fit)
+    fitted = fit_picture(picture.pixels, frame, fit, valid=picture.valid)
     parameters = {
         **candidate.provenance.parameters,
         "format": picture.file_format,
@@ -121,7 +121,7 @@ def _assess(candidate: Candidate, views: ViewSet, frame: FrameSize, fit: Fit) ->
         "fit": fit,
         "kept": f"{fitted.kept:.4f}",
     }
-    warnings = []
+    warnings = list(picture.notes)
     copied = nearest_copy(image_tensor(fitted.image), views)
     if copied is not None:
         warnings.append(f"is nearly a copy of {copied}: it shows nothing new")

@@ -3,8 +3,25 @@
 from __future__ import annotations
 
 import importlib.util
+import struct
+import zlib
 
-from PIL import features
+from PIL import Image, features
+
+# What Pillow raises for damaged files depends on the format and on where the damage is.
+DECODE_ERRORS = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
 
 
 def _words(*lines: str) -> list[str]:
