@@ -15,12 +15,16 @@ _OTHER_COLOUR = 20
 _SAMPLES = 1024  # pixels looked at along a line
 _LEAST_BAR = 0.01  # of the side
 _LARGEST_BAR = 0.45
-_SHARP_WITHIN = 8  # lines: a block of JPEG, or the blur of resizing
+_RINGING = 16  # lines of a bar that compression may have disturbed beside its end: a block of JPEG with halved colours
+_DISTURBED_SHARE = 0.5  # of their pixels, but none as much as a letter on the bar would
+_LETTER = 60
+_SHARP_WITHIN = 4  # lines: the blur of resizing
 _ONE_SIDED, _TWO_SIDED = 0.6, 0.2  # share of the pixels beside a bar that have another colour
 _WHITE = 245  # a bar on one side only may be an overexposed sky
 _MARGIN = 2
 _SAME_STRIP = 0.9  # of the pixels of a line
 _OTHER_STRIP = 0.5
+_EDGE = 0.35  # of the pixels of a line that change where a strip ends
 _LARGEST_STRIP = 0.4
 _LEAST_STRIP = 0.015
 _SIDES = ("top", "bottom", "left", "right")
@@ -90,6 +94,11 @@ def _run(lines: npt.NDArray[np.uint8]) -> tuple[int, float, npt.NDArray[np.float
         run += 1
     if run >= most or run < max(4, len(lines) * _LEAST_BAR):
         return 0, 0.0, colour
+    for _ in range(_RINGING):
+        disturbed, lettered = (_share_of_others(lines[run], colour, level) for level in (_SAME_COLOUR, _LETTER))
+        if disturbed > _DISTURBED_SHARE or lettered > 0.005:
+            break
+        run += 1
     behind = lines[run : run + _SHARP_WITHIN]
     return run, max(_share_of_others(line, colour, _OTHER_COLOUR) for line in behind), colour
 
@@ -114,7 +123,9 @@ def find_overlay(images: Sequence[Pixels], valid: Mask) -> Bars:
     spread = (stack.max(axis=0) - stack.min(axis=0)).max(axis=2)
     same = spread <= 2 * _SAME_COLOUR
     rows, columns = same.mean(axis=1), same.mean(axis=0)
-    lines = [_strip(rows), _strip(rows[::-1]), _strip(columns), _strip(columns[::-1])]
+    upright = stack.swapaxes(1, 2)
+    sides = ((rows, stack), (rows[::-1], stack[:, ::-1]), (columns, upright), (columns[::-1], upright[:, ::-1]))
+    lines = [_strip(shares, pictures) for shares, pictures in sides]
     height, width = same.shape
     # What is known to be a bar already needs no second name.
     known = [
@@ -132,12 +143,16 @@ def find_overlay(images: Sequence[Pixels], valid: Mask) -> Bars:
     return Bars(*news)
 
 
-def _strip(shares: npt.NDArray[np.float64]) -> int:
-    """Lines from the start that are the same in all pictures, if a sharp end follows."""
+def _strip(shares: npt.NDArray[np.float64], pictures: npt.NDArray[np.int16]) -> int:
+    """Lines from the start that are the same in all pictures (picture, line, pixel, 3), if an end follows that is sharp in each of them."""
     most = int(len(shares) * _LARGEST_STRIP) + 1
     run = 0
     while run < most and shares[run] >= _SAME_STRIP:
         run += 1
     if run >= most or run < max(2, len(shares) * _LEAST_STRIP):
         return 0
-    return run + 1 if float(shares[run : run + 4].min()) <= _OTHER_STRIP else 0
+    if float(shares[run : run + 2].min()) > _OTHER_STRIP:
+        return 0
+    # A sky that is white in all photos also ends, but along another line in each.
+    change = np.abs(pictures[:, run + 1] - pictures[:, run - 2]).max(axis=2) > _OTHER_COLOUR
+    return run + 1 if float(np.median(change.mean(axis=1))) >= _EDGE else 0
