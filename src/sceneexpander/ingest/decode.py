@@ -144,6 +144,7 @@ def decode_picture(data: bytes, *, name: str, where: str | Path, max_megapixels:
                 if file_format != "TIFF":  # a PNG may have its tags at the end
                     orientation, lens, xmp, notes = _facts(image)
                 samples = to_rgb(image, data, where)
+                del image  # before the pixels are turned, which takes another copy
         except MemoryError:
             raise UserError("needs more memory than there is", where=where, fix="scale it down") from None
         except DECODE_ERRORS as error:

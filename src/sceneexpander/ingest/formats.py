@@ -16,6 +16,7 @@ DECODE_ERRORS = (
     EOFError,
     LookupError,
     TypeError,
+    RuntimeError,
     AttributeError,
     ArithmeticError,
     struct.error,
@@ -154,7 +155,10 @@ def missing_decoder(file_format: str) -> str | None:
         module, package = _PLUGINS[file_format]
         if importlib.util.find_spec(module) is None:
             return f"install the Python package {package} (pip install {package}), or convert the picture to JPEG"
-        importlib.import_module(module)
+        plugin = importlib.import_module(module)
+        register = getattr(plugin, "register_heif_opener", None)  # the other one registers itself
+        if register is not None:
+            register()
         return None
     needed = _FEATURES.get(file_format)
     if needed is not None and not features.check(needed):

@@ -61,7 +61,9 @@ def to_rgb(image: Image.Image, data: bytes, where: str | Path) -> Samples:
     else:
         profiled, alpha = _split_alpha(image)
     converted = _in_srgb(profiled, image.info.get("icc_profile"), notes)
-    pixels = np.array(converted.convert("RGB"), dtype=np.uint8)
+    del profiled
+    # `convert` copies even if there is nothing to do, and a large photo has few copies to spare.
+    pixels = np.array(converted if converted.mode == "RGB" else converted.convert("RGB"), dtype=np.uint8)
     valid = None if alpha is None else _valid(alpha, where, notes)
     if valid is not None:
         pixels[~valid] = 0
