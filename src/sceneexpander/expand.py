@@ -130,6 +130,7 @@ def expand(request: Request, *, project: Path) -> Path:
         UserError: the input is unusable (nothing has run then), or a stage refused it.
         RuntimeError: a stage failed for another reason.
     """
+    require_folder(request.photos, expected="a folder of photos")
     name = safe_name(request.name or request.photos.resolve().name, fallback="scene")
     folder = project / "runs" / name
     with tempfile.TemporaryDirectory(prefix="sceneexpander-") as scratch:

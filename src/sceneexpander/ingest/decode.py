@@ -297,10 +297,10 @@ def _quiet(file_format: str) -> Iterator[None]:
     """Keep decoders from printing: what is wrong with a file is said once, in one line."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if file_format != "TIFF":
+        if file_format not in ("TIFF", "PNG"):
             yield
             return
-        # libtiff writes to the file descriptor, past Python.
+        # The libraries behind Pillow and OpenCV write to the file descriptor, past Python.
         kept = os.dup(2)
         nowhere = os.open(os.devnull, os.O_WRONLY)
         try:

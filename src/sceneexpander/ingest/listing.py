@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import unicodedata
 from pathlib import Path
@@ -9,8 +10,10 @@ from pathlib import Path
 from sceneexpander.errors import UserError
 from sceneexpander.ingest.links import require_inside
 from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file
-from sceneexpander.ingest.survey import list_pictures
+from sceneexpander.ingest.survey import list_pictures, survey_pictures
 from sceneexpander.plainfiles import list_folder, require_plain_file
+
+logger = logging.getLogger(__name__)
 
 TRUTH_FOLDER = "truth"
 _SAFE_LENGTH = 48
@@ -22,13 +25,17 @@ def scene_files(folder: Path) -> list[Path]:
 
     These are ``scene.yaml``, the captured photos, the pictures to insert (with all candidates) and everything below ``truth/``. Paths
     start with ``folder``; links are followed only where `sceneexpander.ingest.links` allows it, and each path leads to a plain file.
+    Files beside the photos that are none are logged: a copy does not hold them, so nobody will notice them later.
 
     Raises:
         UserError: one line about a file that is missing, leads out of the folder or is no plain file, or what is wrong in ``scene.yaml``.
     """
     facts = read_scene_file(folder)
     images = require_inside(folder / facts.images, folder, where=f"{folder / SCENE_FILE}: 'images'")
-    files = [folder / SCENE_FILE, *list_pictures(images, inside=folder)]
+    survey = survey_pictures(images, inside=folder)
+    for note in survey.notes:
+        logger.warning("%s", note)
+    files = [folder / SCENE_FILE, *survey.pictures]
     for spec in facts.rounds:
         if spec.inserted is not None:
             target = folder / spec.inserted

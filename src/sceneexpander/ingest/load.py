@@ -15,7 +15,7 @@ from torch import Tensor
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.views import LensFacts, ViewRecord, ViewSet, to_uint8
 from sceneexpander.errors import UserError, did_you_mean, printable
-from sceneexpander.ingest.bars import find_bars, find_overlay
+from sceneexpander.ingest.bars import Bars, find_bars, find_overlay
 from sceneexpander.ingest.config import Fit, IngestConfig
 from sceneexpander.ingest.copies import Thumbnail, is_copy, thumbnail
 from sceneexpander.ingest.decode import Picture, pixel_digest, read_picture, read_picture_header
@@ -29,7 +29,7 @@ from sceneexpander.ingest.panorama import (
     panorama_reason,
     strip_reason,
 )
-from sceneexpander.ingest.samples import Pixels
+from sceneexpander.ingest.samples import Mask, Pixels
 from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file, same_name
 from sceneexpander.ingest.survey import survey_pictures
 from sceneexpander.plainfiles import require_folder
@@ -201,15 +201,20 @@ def _knows_lens(lens: LensFacts) -> bool:
 def _fitted_view(picture: Picture, frame: FrameSize, fit: Fit, index: int, notes: list[str]) -> ViewSet:
     shown = printable(picture.name)
     bars = find_bars(picture.pixels)
-    valid = picture.valid
     if bars:
         notes.append(f"{shown}: has bars of one colour ({bars.words(*picture.shape)}), not used")
-        inside = bars.mask(*picture.shape)
-        valid = inside if valid is None else valid & inside
-    fitted = fit_picture(picture.pixels, frame, fit, valid=valid)
+    fitted = fit_picture(picture.pixels, frame, fit, valid=without_bars(picture, bars))
     if fitted.kept < LITTLE_KEPT:
         notes.append(f"{shown}: only {fitted.kept:.0%} of it fits the frame of the first view")
     return view_from_fitted(picture, fitted, view_id=f"{index:03d}_{safe_name(Path(picture.name).stem)}")
+
+
+def without_bars(picture: Picture, bars: Bars) -> Mask | None:
+    """Which pixels of a picture show something, less its bars; None: all."""
+    if not bars:
+        return picture.valid
+    inside = bars.mask(*picture.shape)
+    return inside if picture.valid is None else picture.valid & inside
 
 
 def _without_overlay(views: ViewSet, notes: list[str]) -> ViewSet:

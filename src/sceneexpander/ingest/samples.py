@@ -115,6 +115,8 @@ def decode_wide(data: bytes, where: str | Path) -> npt.NDArray[Any]:
     Raises:
         UserError: they cannot be read.
     """
+    if data.startswith(b"\x89PNG") and not _chunks_fit(data):
+        raise UserError("is a damaged or truncated PNG", where=where, fix="copy it again or remove it")
     try:
         flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
         values = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -126,6 +128,19 @@ def decode_wide(data: bytes, where: str | Path) -> npt.NDArray[Any]:
         order = [2, 1, 0] + ([3] if values.shape[2] > 3 else [])
         values = values[:, :, order]
     return values
+
+
+def _chunks_fit(data: bytes) -> bool:
+    """Whether each chunk of a PNG lies within the file: OpenCV makes room for what a chunk announces before it looks for it."""
+    start = 8
+    while start + 12 <= len(data):
+        length, kind = struct.unpack(">I4s", data[start : start + 8])
+        start += 12 + length
+        if start > len(data):
+            return False
+        if kind == b"IEND":
+            return True
+    return False
 
 
 def _is_wide(image: Image.Image, data: bytes) -> bool:

@@ -217,6 +217,16 @@ def test_what_a_file_says_of_its_depth_counts_more_than_its_brightest_sample() -
     assert decode(tiff(dark // 2, extratags=[(281, "H", 3, (4095,) * 3, True)])).max() == round(2000 * 255 / 4095)
 
 
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("length", [0xFFFFFFF0, 0x7FFFFFFF, 10**6])
+def test_chunks_that_announce_more_than_there_is_cost_nothing(length: int, capfd: pytest.CaptureFixture[str]) -> None:
+    data = bytearray(png_16(quadrants().astype(np.uint16) * 257, (b"tEXt", b"a\0b")))
+    start = data.index(b"tEXt")
+    data[start - 4 : start] = struct.pack(">I", length)
+    assert "damaged" in error_line(bytes(data))
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize("orientation", sorted(STORED))
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_tiff_is_turned_whatever_its_samples(orientation: int, dtype: type) -> None:
