@@ -96,7 +96,7 @@ def sniff_format(head: bytes) -> str | None:
     if head[:6] in (b"GIF87a", b"GIF89a"):
         return "GIF"
     # Raw pictures of Canon are TIFF files with a mark of their own.
-    if head[:4] in (b"II*\0", b"MM\0*") and head[8:10] != b"CR":
+    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+") and head[8:10] != b"CR":
         return "TIFF"
     if head[4:8] == b"ftyp":
         # The major brand comes first; "mif1" and "msf1" only say "some picture", the compatible brands say which.

@@ -10,7 +10,7 @@ from pathlib import Path
 from sceneexpander.errors import UserError
 from sceneexpander.ingest.links import require_inside
 from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file
-from sceneexpander.ingest.survey import list_pictures, survey_pictures
+from sceneexpander.ingest.survey import list_pictures, require_text_name, survey_pictures
 from sceneexpander.plainfiles import list_folder, require_plain_file
 
 logger = logging.getLogger(__name__)
@@ -45,6 +45,7 @@ def scene_files(folder: Path) -> list[Path]:
         files += _truth_files(require_inside(truth, folder), folder)
     for path in files:
         require_plain_file(require_inside(path, folder))
+        require_text_name(path)
     return list(dict.fromkeys(files))
 
 

@@ -249,7 +249,8 @@ def _in_srgb(image: Image.Image, profile: object, notes: list[str]) -> Image.Ima
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         space = source.profile.xcolor_space.strip()
-        if "srgb" in (source.profile.profile_description or "").casefold() and space == "RGB":
+        name = (source.profile.profile_description or "").casefold()
+        if space == "RGB" and "srgb" in name and "linear" not in name:
             return image
         mode = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK", "Lab": "LAB"}.get(space)
         if mode is None or (mode != image.mode and not (mode == "RGB" and image.mode in ("P", "L", "1", "RGBX"))):

@@ -100,13 +100,18 @@ def _kind(path: Path, inside: Path | None) -> str:
     kind = kind_of_file(extension)
     if not named and (kind or sniff_format(_head(path)) is None):
         return kind or "not a picture"
+    require_text_name(path)
+    if inside is not None:
+        require_inside(path, inside)
+    return ""
+
+
+def require_text_name(path: Path) -> None:
+    """Raise `UserError` for a file whose name is not text: it could be written into no record, and into no file of ours."""
     try:
         path.name.encode()
     except UnicodeEncodeError:
         raise UserError("has a name that is not valid text (UTF-8)", where=path, fix="rename the file") from None
-    if inside is not None:
-        require_inside(path, inside)
-    return ""
 
 
 def _head(path: Path) -> bytes:
