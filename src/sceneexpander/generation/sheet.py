@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.errors import printable
-from sceneexpander.ingest.decode import Pixels
 from sceneexpander.ingest.load import image_tensor
+from sceneexpander.ingest.samples import Pixels
 
 _TILE_WIDTH = 256
 _MARGIN = 8

@@ -121,19 +121,15 @@ def find_overlay(images: Sequence[Pixels], valid: Mask) -> Bars:
         return Bars()
     stack = np.stack(list(images)).astype(np.int16)
     spread = (stack.max(axis=0) - stack.min(axis=0)).max(axis=2)
-    same = spread <= 2 * _SAME_COLOUR
+    same = np.asarray(spread <= 2 * _SAME_COLOUR)
     rows, columns = same.mean(axis=1), same.mean(axis=0)
     upright = stack.swapaxes(1, 2)
     sides = ((rows, stack), (rows[::-1], stack[:, ::-1]), (columns, upright), (columns[::-1], upright[:, ::-1]))
     lines = [_strip(shares, pictures) for shares, pictures in sides]
     height, width = same.shape
     # What is known to be a bar already needs no second name.
-    known = [
-        ~valid.any(axis=1),
-        ~valid.any(axis=1)[::-1],
-        ~valid.any(axis=0),
-        ~valid.any(axis=0)[::-1],
-    ]
+    empty_rows, empty_columns = np.asarray(~valid.any(axis=1)), np.asarray(~valid.any(axis=0))
+    known = [empty_rows, empty_rows[::-1], empty_columns, empty_columns[::-1]]
     news = [
         count if count and not bool(names[: max(count - _MARGIN, 1)].all()) else 0
         for count, names in zip(lines, known, strict=True)

@@ -50,7 +50,7 @@ def compare(first: Thumbnail, second: Thumbnail) -> tuple[float, float]:
     spread = float(first.std())
     if spread < _LEAST_SPREAD:
         return 0.0, float(np.abs(first - second).mean()) / _LEAST_SPREAD
-    down, across = np.gradient(first)
+    down, across = (np.asarray(slope) for slope in np.gradient(first))
     step = _SIZE // _TILES
     shifts, remains = [], []
     for top in range(0, _SIZE, step):

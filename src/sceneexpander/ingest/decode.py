@@ -11,12 +11,13 @@ import io
 import os
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
 from sceneexpander.artifacts.store import sha256_of_bytes
@@ -41,7 +42,7 @@ _LARGEST_XMP = 2**20
 _EXIF_ORIENTATION = 0x0112
 _RAW_MARK = 0xC612  # "DNGVersion"
 # How the pixels of a file have to be turned, by the value of its orientation.
-_TURNS = {
+_TURNS: dict[int, Callable[[npt.NDArray[Any]], npt.NDArray[Any]]] = {
     1: lambda p: p,
     2: lambda p: p[:, ::-1],
     3: lambda p: p[::-1, ::-1],

@@ -171,11 +171,11 @@ def _padded(
     source: Image.Image, box: tuple[float, float, float, float], ground: int
 ) -> tuple[Image.Image, tuple[int, int]]:
     """The picture on a canvas that the (possibly protruding) box fits into, and where it lies on it."""
-    before = tuple(max(0, math.ceil(-start - _ROUNDING)) for start in box[:2])
-    after = tuple(max(0, math.ceil(end - size - _ROUNDING)) for end, size in zip(box[2:], source.size, strict=True))
-    if not any((*before, *after)):
+    left, above = (max(0, math.ceil(-start - _ROUNDING)) for start in box[:2])
+    right, below = (max(0, math.ceil(end - size - _ROUNDING)) for end, size in zip(box[2:], source.size, strict=True))
+    if not any((left, above, right, below)):
         return source, (0, 0)
-    size = (source.width + before[0] + after[0], source.height + before[1] + after[1])
+    size = (source.width + left + right, source.height + above + below)
     canvas = Image.new(source.mode, size, (ground,) * len(source.getbands()) if len(source.getbands()) > 1 else ground)
-    canvas.paste(source, before)
-    return canvas, (before[0], before[1])
+    canvas.paste(source, (left, above))
+    return canvas, (left, above)

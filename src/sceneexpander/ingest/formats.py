@@ -155,10 +155,12 @@ def missing_decoder(file_format: str) -> str | None:
         module, package = _PLUGINS[file_format]
         if importlib.util.find_spec(module) is None:
             return f"install the Python package {package} (pip install {package}), or convert the picture to JPEG"
-        plugin = importlib.import_module(module)
-        register = getattr(plugin, "register_heif_opener", None)  # the other one registers itself
-        if register is not None:
-            register()
+        if file_format == "HEIF":
+            import pillow_heif
+
+            pillow_heif.register_heif_opener()
+        else:
+            import pillow_jxl  # noqa: F401 - registers itself
         return None
     needed = _FEATURES.get(file_format)
     if needed is not None and not features.check(needed):

@@ -219,7 +219,8 @@ def without_bars(picture: Picture, bars: Bars) -> Mask | None:
 
 def _without_overlay(views: ViewSet, notes: list[str]) -> ViewSet:
     validity = views.validity().numpy()
-    overlay = find_overlay([to_uint8(image) for image in views.images], validity.any(axis=0))
+    shown = views.validity().any(dim=0).numpy()
+    overlay = find_overlay([to_uint8(image) for image in views.images], shown)
     if not overlay:
         return views
     notes.append(
