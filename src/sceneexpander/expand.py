@@ -7,6 +7,8 @@ The methods are those that the project selects.
 from __future__ import annotations
 
 import argparse
+import logging
+import re
 import shutil
 import sys
 import tempfile
@@ -17,12 +19,14 @@ from pathlib import Path
 import yaml
 
 from sceneexpander.errors import UserError, entry_point
-from sceneexpander.ingest import list_pictures, make_round, read_picture, safe_name
+from sceneexpander.ingest import make_round, read_picture, safe_name, survey_pictures
+from sceneexpander.plainfiles import require_folder
 from sceneexpander.preflight import check_scene
 from sceneexpander.project import find_project
 from sceneexpander.workspace import Selection, make_workspace, merged_overrides, read_selection, reproduce
 
 SCENE_FILE = "scene.yaml"
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,8 +74,7 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
         UserError: the folder, a picture or an option is unusable.
     """
     photos = request.photos
-    if not photos.is_dir():
-        raise UserError("is not a folder" if photos.exists() else "does not exist", where=photos)
+    require_folder(photos, expected="a folder of photos")
     words = (request.prompts, request.motions, request.objects, request.inserted)
     if (photos / SCENE_FILE).is_file():
         if any(words):
@@ -92,7 +95,10 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
     ]
     captured = target / "captured"
     captured.mkdir(parents=True)
-    for path in list_pictures(photos):
+    survey = survey_pictures(photos)
+    for note in survey.notes:
+        logger.warning("%s", note)
+    for path in survey.pictures:
         shutil.copyfile(path, captured / path.name)
     rounds = []
     for k, spec in enumerate(specs):
@@ -102,7 +108,9 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
             )
         source = request.inserted[k]
         read_picture(source, max_megapixels=200.0)
-        copy = Path("inserted") / f"round_{k + 1}{source.suffix.lower()}"
+        # The content decides what it is: an ending is for people, and may be as odd or long as the whole name.
+        ending = source.suffix.lower() if re.fullmatch(r"\.[A-Za-z0-9]{1,8}", source.suffix) else ""
+        copy = Path("inserted") / f"round_{k + 1}{ending}"
         (target / copy).parent.mkdir(exist_ok=True)
         shutil.copyfile(source, target / copy)
         words_of_round = {"prompt": spec.prompt, "motion": spec.motion, "object": spec.new_object}
@@ -122,6 +130,7 @@ def expand(request: Request, *, project: Path) -> Path:
         UserError: the input is unusable (nothing has run then), or a stage refused it.
         RuntimeError: a stage failed for another reason.
     """
+    require_folder(request.photos, expected="a folder of photos")
     name = safe_name(request.name or request.photos.resolve().name, fallback="scene")
     folder = project / "runs" / name
     with tempfile.TemporaryDirectory(prefix="sceneexpander-") as scratch:

@@ -11,6 +11,7 @@ from sceneexpander.config.compose import compose, scene_option
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
+from sceneexpander.evaluation.truth import load_truth
 from sceneexpander.expansion import ModelConfig, load_model
 from sceneexpander.generation import generate_inserted_view
 from sceneexpander.inference.config import RivalsConfig
@@ -45,6 +46,7 @@ def check_scene(
     config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
     check_device(config.device)
     scene = load_scene(folder, config.scene)
+    load_truth(folder)  # read by the last stages only, so a mistake in it would cost the whole run
     count = len(scene.rounds) if rounds is None else rounds
     for number in range(1, count + 1):
         generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)

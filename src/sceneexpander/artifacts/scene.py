@@ -39,12 +39,13 @@ class KnownCameras:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Made by ``prepare``; read by every later stage."""
+    """Made by ``prepare``; read by every later stage. ``notes`` say what was noticed about the user's files."""
 
     name: str
     views: ViewSet
     rounds: tuple[RoundSpec, ...]
     known: KnownCameras | None = None
+    notes: tuple[str, ...] = ()
 
     def round_spec(self, number: int) -> RoundSpec:
         """The sentence of round ``number`` (from 1). Raises `ArtifactError` if the scene does not define it."""
@@ -65,7 +66,8 @@ class Scene:
                 value = getattr(self.known, key)
                 if value is not None:
                     tensors[f"known.{key}"] = value
-        facts = {"name": self.name, "rounds": self.rounds, "metric": self.known is not None and self.known.metric}
+        metric = self.known is not None and self.known.metric
+        facts = {"name": self.name, "rounds": self.rounds, "metric": metric, "notes": self.notes}
         save_artifact(folder, SCHEMA, facts, tensors)
 
     @classmethod
@@ -84,4 +86,5 @@ class Scene:
             views=ViewSet.load(folder / "views"),
             rounds=tuple(RoundSpec(**item) for item in facts["rounds"]),
             known=known,
+            notes=tuple(facts.get("notes", ())),
         )

@@ -71,11 +71,16 @@ class ViewRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewSet:
-    """S views of one size. ``detail_images`` show the same framing at a higher resolution, for feature matching."""
+    """S views of one size. ``detail_images`` show the same framing at a higher resolution, for feature matching.
+
+    ``valid`` are the pixels that show the place: not what was transparent, the border of a padded picture, bars, or an overlay.
+    None: all of them.
+    """
 
     records: tuple[ViewRecord, ...]
     images: Float[Tensor, "view 3 height width"]  # RGB in [0, 1]
     detail_images: Float[Tensor, "view 3 detail_height detail_width"]
+    valid: Bool[Tensor, "view height width"] | None = None
 
     def __post_init__(self) -> None:
         ids = [record.view_id for record in self.records]
@@ -87,6 +92,8 @@ class ViewSet:
             )
         if self.images.ndim != 4 or self.images.shape[1] != 3:
             raise ValueError(f"images have shape {tuple(self.images.shape)}, expected (view, 3, height, width)")
+        if self.valid is not None and self.valid.shape != (len(ids), *self.images.shape[2:]):
+            raise ValueError(f"masks have shape {tuple(self.valid.shape)}, images {tuple(self.images.shape)}")
 
     def __len__(self) -> int:
         return len(self.records)
@@ -118,17 +125,26 @@ class ViewSet:
             records=tuple(self.records[i] for i in picked),
             images=self.images[picked],
             detail_images=self.detail_images[picked],
+            valid=None if self.valid is None else self.valid[picked],
         )
 
     def append(self, other: ViewSet) -> ViewSet:
         """These views followed by the other ones, which must have the same sizes."""
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"views of {tuple(other.images.shape[1:])} cannot join {tuple(self.images.shape[1:])}")
+        masked = self.valid is not None or other.valid is not None
         return ViewSet(
             records=self.records + other.records,
             images=torch.cat([self.images, other.images]),
             detail_images=torch.cat([self.detail_images, other.detail_images]),
+            valid=torch.cat([self.validity(), other.validity().to(self.images.device)]) if masked else None,
         )
+
+    def validity(self) -> Bool[Tensor, "view height width"]:
+        """``valid``, written out where everything is."""
+        if self.valid is not None:
+            return self.valid
+        return torch.ones(len(self), self.height, self.width, dtype=torch.bool, device=self.images.device)
 
     def save(self, folder: Path) -> None:
         """Write into an existing or new (scratch) folder: lossless pictures and the records."""
@@ -137,18 +153,22 @@ class ViewSet:
         for record, image, detail in zip(self.records, self.images, self.detail_images, strict=True):
             save_png(folder / "images" / f"{record.view_id}.png", image)
             save_png(folder / "detail" / f"{record.view_id}.png", detail)
-        save_artifact(folder, SCHEMA, {"records": self.records}, {})
+        tensors = {} if self.valid is None else {"valid": self.valid.to(torch.uint8)}
+        save_artifact(folder, SCHEMA, {"records": self.records}, tensors)
 
     @classmethod
     def load(cls, folder: Path) -> ViewSet:
         """Read what `save` wrote. Raises `ArtifactError` if a picture or record is missing or damaged."""
-        facts, _ = load_artifact(folder, SCHEMA)
+        facts, tensors = load_artifact(folder, SCHEMA)
         records = tuple(_record_from_plain(item) for item in facts["records"])
         if not records:
             raise ArtifactError("holds no views", where=folder, fix="rerun the stage that makes it")
         images = torch.stack([load_png(folder / "images" / f"{r.view_id}.png") for r in records])
         detail = torch.stack([load_png(folder / "detail" / f"{r.view_id}.png") for r in records])
-        return cls(records=records, images=images, detail_images=detail)
+        valid = tensors["valid"].to(torch.bool) if "valid" in tensors else None
+        if valid is not None and valid.shape != (len(records), *images.shape[2:]):
+            raise ArtifactError("holds masks of another size", where=folder, fix="rerun the stage that makes it")
+        return cls(records=records, images=images, detail_images=detail, valid=valid)
 
 
 def _record_from_plain(item: dict[str, Any]) -> ViewRecord:

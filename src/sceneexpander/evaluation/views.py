@@ -3,12 +3,14 @@
 Everything is rendered at the cameras that the reconstruction itself gives its views, on black: each method has its own gauge, and
 true cameras are not known in general. What a high score here does not say: that the geometry is right. A reconstruction whose views
 each paint only their own pixels scores well; the ``others_`` columns of `ViewMetrics` are there to notice that.
+
+Pixels of a picture that do not show the place (`ViewSet.valid`) count in none of the numbers; for ST-LPIPS they are black on both sides.
 """
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.artifacts.metrics import ViewMetrics
@@ -97,52 +99,69 @@ def _rows(
             continue
         if view_id not in picture_of:
             raise ValueError(f"no picture of view {view_id!r} was given, only {list(picture_of)}")
-        rows.append(_row(reconstruction, index, views.images[picture_of[view_id]], config))
+        place = picture_of[view_id]
+        valid = None if views.valid is None else views.valid[place]
+        if valid is not None and int(valid.sum()) < _FEWEST_PIXELS:
+            valid = None
+        rows.append(_row(reconstruction, index, views.images[place], valid, config))
     return tuple(rows)
 
 
 def _row(
-    reconstruction: Reconstruction, index: int, picture: Float[Tensor, "3 height width"], config: EvaluateConfig
+    reconstruction: Reconstruction,
+    index: int,
+    picture: Float[Tensor, "3 height width"],
+    valid: Bool[Tensor, "height width"] | None,
+    config: EvaluateConfig,
 ) -> ViewMetrics:
     gaussians = reconstruction.gaussians
     camera = (reconstruction.world_from_cam[index : index + 1], reconstruction.intrinsics_px[index : index + 1])
     height, width = picture.shape[1:]
     seen = _see(gaussians, *camera, height, width, config)
     alpha = seen.alpha[0]
-    covered = alpha > config.coverage_alpha
+    counted = torch.ones_like(alpha, dtype=torch.bool) if valid is None else valid
+    covered = (alpha > config.coverage_alpha) & counted
     depth = reconstruction.depth[index]
     relative = (seen.depth[0] - depth).abs()[covered] / depth[covered]
     others_coverage, others_psnr = None, None
     if config.cross_view and len(reconstruction.view_ids) > 1:
         others = gaussians.select(gaussians.source_view != index)
-        others_coverage, others_psnr = _seen_by_others(others, camera, picture, config)
+        others_coverage, others_psnr = _seen_by_others(others, camera, picture, counted, config)
     return ViewMetrics(
         view_id=reconstruction.view_ids[index],
         generated=bool(reconstruction.generated[index]),
         posed=bool(reconstruction.posed[index]),
-        psnr_db=min(psnr(seen.rgb[0], picture), PSNR_CAP_DB),
-        ssim=ssim(seen.rgb[0], picture),
-        coverage=float(covered.double().mean()),
-        generated_share=float((seen.generated[0] * alpha).sum() / alpha.sum().clamp(min=1e-12)),
+        psnr_db=min(psnr(seen.rgb[0], picture, valid), PSNR_CAP_DB),
+        ssim=ssim(seen.rgb[0], picture, valid),
+        coverage=_share(covered, counted),
+        generated_share=float((seen.generated[0] * alpha)[counted].sum() / alpha[counted].sum().clamp(min=1e-12)),
         depth_disagreement=float(relative.median()) if len(relative) else None,
         others_coverage=others_coverage,
         others_psnr_db=others_psnr,
-        st_lpips=st_lpips(seen.rgb[0], picture) if config.st_lpips else None,
+        st_lpips=st_lpips(seen.rgb[0] * counted, picture * counted) if config.st_lpips else None,
     )
 
 
+def _share(covered: Bool[Tensor, "height width"], counted: Bool[Tensor, "height width"]) -> float:
+    return float(covered[counted].double().mean())
+
+
 def _seen_by_others(
-    others: Gaussians, camera: tuple[Tensor, Tensor], picture: Float[Tensor, "3 height width"], config: EvaluateConfig
+    others: Gaussians,
+    camera: tuple[Tensor, Tensor],
+    picture: Float[Tensor, "3 height width"],
+    counted: Bool[Tensor, "height width"],
+    config: EvaluateConfig,
 ) -> tuple[float, float | None]:
     if not len(others):
         return 0.0, None
     seen = _see(others, *camera, picture.shape[1], picture.shape[2], config)
-    covered = seen.alpha[0] > config.coverage_alpha
+    covered = (seen.alpha[0] > config.coverage_alpha) & counted
     if int(covered.sum()) < _FEWEST_PIXELS:
-        return float(covered.double().mean()), None
+        return _share(covered, counted), None
     # Divided by alpha: what is compared is the colour that is there, not the black behind it.
     colour = seen.rgb[0] / seen.alpha[0].clamp(min=1e-6)
-    return float(covered.double().mean()), min(psnr(colour, picture, covered), PSNR_CAP_DB)
+    return _share(covered, counted), min(psnr(colour, picture, covered), PSNR_CAP_DB)
 
 
 def _see(

@@ -277,11 +277,14 @@ def refined(
     """The reconstruction with its Gaussians fitted to the pictures they were made from, see `refine`.
 
     With ``doubt_generated`` a generated picture is believed where no captured view sees the place or one agrees (`pixel_trust`);
-    otherwise it counts like a photo, as for the baseline, which does not know better.
+    otherwise it counts like a photo, as for the baseline, which does not know better. Pixels that do not show the place count nothing.
     """
     weights = None
     if config.steps and doubt_generated and bool(reconstruction.generated.any()):
         weights = pixel_trust(reconstruction, views.images)
+    if views.valid is not None:
+        shown = views.valid.to(reconstruction.depth)
+        weights = shown if weights is None else weights * shown
     return refine(reconstruction, views.images, config, weights=weights, seed=seed, device=device, on_step=on_step)
 
 

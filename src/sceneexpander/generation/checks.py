@@ -9,23 +9,29 @@ from torch import Tensor
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.errors import UserError
 from sceneexpander.ingest.decode import Picture
+from sceneexpander.ingest.load import is_single_colour
+from sceneexpander.ingest.panorama import panorama_reason, strip_reason
 
 SMALLEST_SIDE_PX = 64
-_CONSTANT_SPREAD = 2.0  # grey levels: below it a picture shows nothing
 _COPY_CELLS = 32
 _COPY_DIFFERENCE = 0.1
 
 
 def check_content(picture: Picture, where: str) -> None:
-    """Raise `UserError` for a picture that decodes but cannot be a view: tiny, or all of one colour."""
+    """Raise `UserError` for a picture that decodes but cannot be a view: tiny, all of one colour, a strip or a panorama."""
     if min(picture.height, picture.width) < SMALLEST_SIDE_PX:
         raise UserError(
             f"has only {picture.width} x {picture.height} pixels",
             where=where,
             fix=f"use a picture of at least {SMALLEST_SIDE_PX} px on each side",
         )
-    if float(picture.pixels.reshape(-1, 3).std(axis=0).max()) < _CONSTANT_SPREAD:
+    if is_single_colour(picture.pixels):
         raise UserError("shows a single colour", where=where, fix="use a picture of the place")
+    reason = strip_reason(picture.height, picture.width) or panorama_reason(
+        picture.pixels, picture.xmp, has_lens=picture.lens.focal_px is not None
+    )
+    if reason is not None:
+        raise UserError(reason, where=where)
 
 
 def nearest_copy(image: Float[Tensor, "3 height width"], references: ViewSet) -> str | None:

@@ -19,10 +19,12 @@ from sceneexpander.generation.config import GeneratorConfig
 from sceneexpander.generation.prompt import fill_prompt
 from sceneexpander.generation.protocol import Candidate, GenerationContext
 from sceneexpander.generation.sheet import contact_sheet
+from sceneexpander.ingest.bars import find_bars
 from sceneexpander.ingest.config import Fit
 from sceneexpander.ingest.decode import Picture, decode_picture
 from sceneexpander.ingest.fit import FittedPicture, FrameSize, fit_picture
-from sceneexpander.ingest.load import LITTLE_KEPT, image_tensor, view_from_fitted
+from sceneexpander.ingest.load import LITTLE_KEPT, image_tensor, view_from_fitted, without_bars
+from sceneexpander.ingest.panorama import doubtful_shape
 
 logger = logging.getLogger(__name__)
 
@@ -113,7 +115,8 @@ def _assess(candidate: Candidate, views: ViewSet, frame: FrameSize, fit: Fit) ->
         # One bad candidate must not hide the others: it counts as refused, and only choosing it is an error.
         refusal = f"{error.problem}; {error.fix}" if error.fix else error.problem
         return _Assessed(name=candidate.name, provenance=replace(candidate.provenance, refusal=refusal))
-    fitted = fit_picture(picture.pixels, frame, fit)
+    bars = find_bars(picture.pixels)
+    fitted = fit_picture(picture.pixels, frame, fit, valid=without_bars(picture, bars))
     parameters = {
         **candidate.provenance.parameters,
         "format": picture.file_format,
@@ -121,7 +124,12 @@ def _assess(candidate: Candidate, views: ViewSet, frame: FrameSize, fit: Fit) ->
         "fit": fit,
         "kept": f"{fitted.kept:.4f}",
     }
-    warnings = []
+    warnings = list(picture.notes)
+    if bars:
+        warnings.append(f"has bars of one colour ({bars.words(*picture.shape)}), not used")
+    doubt = doubtful_shape(picture.height, picture.width, has_lens=picture.lens.focal_px is not None)
+    if doubt is not None:
+        warnings.append(doubt)
     copied = nearest_copy(image_tensor(fitted.image), views)
     if copied is not None:
         warnings.append(f"is nearly a copy of {copied}: it shows nothing new")

@@ -10,8 +10,9 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from sceneexpander.artifacts.views import ViewSet, to_uint8
-from sceneexpander.ingest.decode import Pixels
+from sceneexpander.errors import printable
 from sceneexpander.ingest.load import image_tensor
+from sceneexpander.ingest.samples import Pixels
 
 _TILE_WIDTH = 256
 _MARGIN = 8
@@ -50,6 +51,7 @@ def _tile(pixels: Pixels | None, height: int, caption: str, *, border: tuple[int
     if pixels is not None:
         picture = Image.fromarray(pixels).resize((_TILE_WIDTH, height), Image.Resampling.LANCZOS)
         canvas.paste(picture, (_MARGIN, _MARGIN))
+    caption = printable(caption)  # a name may hold a line break, which a caption has no room for
     font = ImageFont.load_default(size=13)
     while caption and draw.textlength(caption, font=font) > _TILE_WIDTH:
         caption = caption[:-2].rstrip("…") + "…" if len(caption) > 2 else ""

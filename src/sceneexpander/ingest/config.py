@@ -9,6 +9,8 @@ from sceneexpander.errors import UserError
 
 Fit = Literal["crop", "pad"]
 FITS: tuple[Fit, ...] = ("crop", "pad")
+# Beyond these a stage would only run out of memory: no reconstructor takes more.
+_LARGEST = {"long_side_px": 4200, "detail_scale": 8, "multiple": 512, "max_views": 1000, "max_megapixels": 1000.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,7 +24,7 @@ class IngestConfig:
             fills the border with neutral grey.
         multiple: both stored sides are multiples of this (the patch size of the reconstructors).
         max_views: more captured views than this are refused: memory and time grow with their number.
-        max_megapixels: larger pictures are refused before they are decoded.
+        max_megapixels: larger pictures are refused before they are decoded, as are files of few bytes that announce many pixels.
         allow_single_view: accept a scene of one photo.
     """
 
@@ -35,9 +37,11 @@ class IngestConfig:
     allow_single_view: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("long_side_px", "detail_scale", "multiple", "max_views", "max_megapixels"):
-            if getattr(self, name) <= 0:
-                raise UserError(f"must be positive, is {getattr(self, name)}", where=f"ingest.{name}")
+        for name, largest in _LARGEST.items():
+            value = getattr(self, name)
+            if not 0 < value <= largest:
+                problem = f"must be positive, is {value}" if not value > 0 else f"is {value}, more than {largest:g}"
+                raise UserError(problem, where=f"ingest.{name}", fix=f"use at most {largest:g}")
         if self.long_side_px % self.multiple:
             lower = max(1, self.long_side_px // self.multiple) * self.multiple
             raise UserError(

@@ -1,46 +1,57 @@
-"""From the bytes of a picture file to upright 8-bit RGB pixels.
+"""From the bytes of a picture file to upright 8-bit RGB pixels, and what the file says of its lens.
 
 The first bytes decide what a file is, never its name. Every way in which a file can be unusable ends as a `UserError` that names it.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import io
-import struct
+import os
 import threading
-import zlib
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, ImageOps
+from PIL import Image
 
 from sceneexpander.artifacts.store import sha256_of_bytes
+from sceneexpander.artifacts.views import LensFacts
 from sceneexpander.errors import UserError
-
-Pixels = npt.NDArray[np.uint8]
-
-_EXIF_ORIENTATION = 0x0112
-_EXIF_IFD = 0x8769
-_EXIF_FOCAL_35MM = 0xA405
-_DIAGONAL_35MM = float(np.hypot(36.0, 24.0))
-_ALPHA_MODES = {"LA", "La", "PA", "RGBA", "RGBa"}
-_HEIF_BRANDS = {b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1"}
-# What Pillow raises for damaged files depends on the format and on where the damage is.
-_DECODE_ERRORS = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    LookupError,
-    TypeError,
-    ArithmeticError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
+from sceneexpander.ingest.formats import (
+    DECODE_ERRORS,
+    PILLOW_FORMATS,
+    missing_decoder,
+    name_of_content,
+    sniff_format,
 )
+from sceneexpander.ingest.lens import read_lens
+from sceneexpander.ingest.samples import Mask, Pixels, float_colour_tiff_size, read_float_colour_tiff, to_rgb
+from sceneexpander.plainfiles import read_plain_file
+
+LIMIT_BYTES = 512 * 2**20  # of a picture file
+# Real photos have more bytes per pixel than a hundred times this. A file of few bytes that announces many pixels costs memory for nothing.
+_LEAST_BYTES_PER_PIXEL = 0.002
+_ALWAYS_DECODED_MEGAPIXELS = 16.0
+_LARGEST_XMP = 2**20
+_EXIF_ORIENTATION = 0x0112
+_RAW_MARK = 0xC612  # "DNGVersion"
+# How the pixels of a file have to be turned, by the value of its orientation.
+_TURNS: dict[int, Callable[[npt.NDArray[Any]], npt.NDArray[Any]]] = {
+    1: lambda p: p,
+    2: lambda p: p[:, ::-1],
+    3: lambda p: p[::-1, ::-1],
+    4: lambda p: p[::-1],
+    5: lambda p: p.swapaxes(0, 1),
+    6: lambda p: np.rot90(p, -1),
+    7: lambda p: np.rot90(p, 2).swapaxes(0, 1),
+    8: lambda p: np.rot90(p, 1),
+}
 _open_lock = threading.Lock()
 
 
@@ -52,7 +63,10 @@ class Picture:
     pixels: Pixels  # (H, W, 3) RGB
     sha256: str  # of the file's bytes
     file_format: str  # what the bytes are: "JPEG", "PNG", ...
-    exif_focal_px: float | None  # from the 35 mm equivalent focal length, in original pixels
+    lens: LensFacts
+    valid: Mask | None = None  # (H, W) pixels that show something; None: all
+    xmp: str = ""
+    notes: tuple[str, ...] = ()  # what was noticed, to be read after the picture's name
 
     @property
     def height(self) -> int:
@@ -64,32 +78,26 @@ class Picture:
         """Columns."""
         return int(self.pixels.shape[1])
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.height, self.width
 
-def sniff_format(head: bytes) -> str | None:
-    """The picture format that the first bytes announce (Pillow's name, or ``HEIF``), or None."""
-    if head.startswith(b"\xff\xd8\xff"):
-        return "JPEG"
-    if head.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "PNG"
-    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
-        return "WEBP"
-    if head[:6] in (b"GIF87a", b"GIF89a"):
-        return "GIF"
-    if head[:4] in (b"II*\0", b"MM\0*"):
-        return "TIFF"
-    if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
-        return "HEIF"
-    # "BM" is two letters only: the reserved words and the header length must fit as well.
-    if head[:2] == b"BM" and len(head) >= 18 and head[6:10] == bytes(4) and head[15:18] == bytes(3):
-        return "BMP"
-    return None
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureHeader:
+    """What is known of a picture before its pixels are decoded. Sizes are those of the upright picture."""
+
+    height: int
+    width: int
+    lens: LensFacts
+    xmp: str
 
 
 def read_picture(path: Path, *, max_megapixels: float = 200.0) -> Picture:
     """Read and decode one picture file (the first frame of an animated one).
 
-    Transparent pictures are composited over black, which is also what the renderer shows where a scene has nothing. 16-bit samples
-    are scaled from their full range to 8 bits; CMYK and palette pictures become RGB; embedded colour profiles are not applied.
+    What becomes of samples, colours and transparency: see `sceneexpander.ingest.samples.to_rgb`.
 
     Raises:
         UserError: the file is missing, empty, truncated, too large, or not a picture that can be decoded.
@@ -97,49 +105,90 @@ def read_picture(path: Path, *, max_megapixels: float = 200.0) -> Picture:
     return decode_picture(_read_bytes(path), name=path.name, where=path, max_megapixels=max_megapixels)
 
 
+def read_picture_header(path: Path, *, max_megapixels: float = 200.0) -> PictureHeader:
+    """What the header of a picture file says. Raises as `read_picture` does."""
+    data = _read_bytes(path)
+    file_format = _checked_format(data, path)
+    with _quiet(file_format):
+        size = _float_colour_size(data, file_format, path, max_megapixels)
+        if size is not None:
+            return PictureHeader(height=size[0], width=size[1], lens=LensFacts(), xmp="")
+        image = _open(data, file_format, path, max_megapixels)
+        orientation, lens, xmp, _ = _facts(image)
+    height, width = _upright_size(image, orientation)
+    return PictureHeader(height=height, width=width, lens=lens, xmp=xmp)
+
+
 def read_picture_shape(path: Path, *, max_megapixels: float = 200.0) -> tuple[int, int]:
     """(height, width) of a picture file as it stands upright, from its header alone. Raises as `read_picture` does."""
-    data = _read_bytes(path)
-    image = _open(data, _checked_format(data, path), path, max_megapixels)
-    turned = _orientation(image) >= 5  # the four orientations that swap the axes
-    return (image.width, image.height) if turned else (image.height, image.width)
+    header = read_picture_header(path, max_megapixels=max_megapixels)
+    return header.height, header.width
 
 
 def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise UserError("does not exist", where=path) from None
-    except OSError as error:
-        raise UserError(f"cannot be read ({error.strerror or error})", where=path) from None
+    return read_plain_file(path, limit_bytes=LIMIT_BYTES)
 
 
 def decode_picture(data: bytes, *, name: str, where: str | Path, max_megapixels: float = 200.0) -> Picture:
     """`read_picture` for bytes; ``where`` is what error messages name."""
     file_format = _checked_format(data, where)
-    image = _decode(data, file_format, where, max_megapixels)
-    focal_35mm = _focal_35mm(image)
-    pixels = _rgb_pixels(_upright(image), where)
-    height, width = pixels.shape[:2]
-    # The 35 mm equivalent is defined by the diagonal of the frame (CIPA DCG-001), whatever the aspect ratio.
-    focal_px = None if focal_35mm is None else focal_35mm / _DIAGONAL_35MM * float(np.hypot(height, width))
+    orientation, lens, xmp, notes = 1, LensFacts(), "", list[str]()
+    with _quiet(file_format):
+        try:
+            if _float_colour_size(data, file_format, where, max_megapixels) is not None:
+                samples = read_float_colour_tiff(data, where)
+            else:
+                image = _open(data, file_format, where, max_megapixels)
+                if file_format == "TIFF":
+                    orientation, lens, xmp, notes = _facts(image)
+                image.load()
+                if file_format != "TIFF":  # a PNG may have its tags at the end
+                    orientation, lens, xmp, notes = _facts(image)
+                samples = to_rgb(image, data, where)
+                del image  # before the pixels are turned, which takes another copy
+        except MemoryError:
+            raise UserError("needs more memory than there is", where=where, fix="scale it down") from None
+        except DECODE_ERRORS as error:
+            _refuse_damaged(file_format, error, where)
+    turn = _TURNS[1 if samples.upright else orientation]
     return Picture(
-        name=name, pixels=pixels, sha256=sha256_of_bytes(data), file_format=file_format, exif_focal_px=focal_px
+        name=name,
+        pixels=np.ascontiguousarray(turn(samples.pixels)),
+        valid=None if samples.valid is None else np.ascontiguousarray(turn(samples.valid)),
+        sha256=sha256_of_bytes(data),
+        file_format=file_format,
+        lens=lens,
+        xmp=xmp,
+        notes=(*notes, *samples.notes),
     )
+
+
+def _float_colour_size(
+    data: bytes, file_format: str, where: str | Path, max_megapixels: float
+) -> tuple[int, int] | None:
+    size = float_colour_tiff_size(data) if file_format == "TIFF" else None
+    if size is not None:
+        _check_size(size, len(data), max_megapixels, where)
+    return size
+
+
+def pixel_digest(picture: Picture) -> str:
+    """Digest of the upright pixels: the same photo saved with other metadata, or in another lossless format, is still the same photo."""
+    digest = hashlib.sha256(f"{picture.height}x{picture.width}:".encode())
+    digest.update(picture.pixels.data)
+    return digest.hexdigest()
 
 
 def _checked_format(data: bytes, where: str | Path) -> str:
     if not data:
         raise UserError("is empty (0 bytes)", where=where, fix="copy the picture again or remove it")
-    file_format = sniff_format(data[:32])
+    file_format = sniff_format(data[:64])
     if file_format is None:
         _refuse_unknown(data, where)
-    if file_format == "HEIF":
-        raise UserError(
-            "is a HEIC/HEIF picture, which cannot be decoded here",
-            where=where,
-            fix="convert it to JPEG or PNG (the Python package pillow-heif can do it)",
-        )
+    missing = missing_decoder(file_format)
+    if missing is not None:
+        name = "HEIC/HEIF" if file_format == "HEIF" else file_format
+        raise UserError(f"is a {name} picture, which cannot be decoded here", where=where, fix=missing)
     return file_format
 
 
@@ -151,6 +200,11 @@ def _refuse_unknown(data: bytes, where: str | Path) -> NoReturn:
             "is a raw float32 depth map (ETH3D names its ground-truth depth .JPG), not a picture",
             where=where,
             fix="point the scene at the folder of photos, not at ground_truth_depth",
+        )
+    name = name_of_content(data[:64])
+    if name is not None:
+        raise UserError(
+            f"is not a picture but {name}", where=where, fix="use JPEG, PNG, WebP, BMP or TIFF, or remove the file"
         )
     raise UserError(
         f"is not a picture (its first bytes are {data[:8].hex(' ')})",
@@ -171,7 +225,7 @@ def _looks_like_depth_dump(data: bytes) -> bool:
 
 
 def _open(data: bytes, file_format: str, where: str | Path, max_megapixels: float) -> Image.Image:
-    formats = ["JPEG", "MPO"] if file_format == "JPEG" else [file_format]
+    formats = PILLOW_FORMATS.get(file_format, [file_format])
     try:
         with _open_lock:
             # Pillow's own limit is a global and lower than ours; sizes are checked here, before any pixel is decoded.
@@ -180,27 +234,30 @@ def _open(data: bytes, file_format: str, where: str | Path, max_megapixels: floa
                 image = Image.open(io.BytesIO(data), formats=formats)
             finally:
                 Image.MAX_IMAGE_PIXELS = pillow_limit
-    except _DECODE_ERRORS as error:
+    except DECODE_ERRORS as error:
         _refuse_damaged(file_format, error, where)
-    megapixels = image.width * image.height / 1e6
+    _check_size((image.height, image.width), len(data), max_megapixels, where)
+    if _RAW_MARK in getattr(image, "tag_v2", ()):
+        raise UserError("is a raw picture (DNG)", where=where, fix="develop it to JPEG or PNG, or remove it")
+    return image
+
+
+def _check_size(size: tuple[int, int], size_bytes: int, max_megapixels: float, where: str | Path) -> None:
+    height, width = size
+    pixels = width * height
+    megapixels = pixels / 1e6
     if megapixels > max_megapixels:
         raise UserError(
-            f"has {image.width} x {image.height} pixels ({megapixels:.0f} MP), more than the {max_megapixels:g} MP allowed",
+            f"has {width} x {height} pixels ({megapixels:.0f} MP), more than the {max_megapixels:g} MP allowed",
             where=where,
             fix="scale it down or raise max_megapixels",
         )
-    return image
-
-
-def _decode(data: bytes, file_format: str, where: str | Path, max_megapixels: float) -> Image.Image:
-    image = _open(data, file_format, where, max_megapixels)
-    try:
-        image.load()
-    except _DECODE_ERRORS as error:
-        _refuse_damaged(file_format, error, where)
-    except MemoryError:
-        raise UserError("needs more memory than there is", where=where, fix="scale it down") from None
-    return image
+    if megapixels > _ALWAYS_DECODED_MEGAPIXELS and size_bytes < pixels * _LEAST_BYTES_PER_PIXEL:
+        raise UserError(
+            f"announces {width} x {height} pixels in {size_bytes} bytes: no photo is like that",
+            where=where,
+            fix="scale it down or remove it",
+        )
 
 
 def _refuse_damaged(file_format: str, error: BaseException, where: str | Path) -> NoReturn:
@@ -213,51 +270,44 @@ def _refuse_damaged(file_format: str, error: BaseException, where: str | Path) -
 def _exif(image: Image.Image) -> Image.Exif | None:
     try:
         return image.getexif()
-    except _DECODE_ERRORS:
+    except DECODE_ERRORS:
         return None  # a damaged tag block says nothing about the pixels
 
 
-def _orientation(image: Image.Image) -> int:
+def _facts(image: Image.Image) -> tuple[int, LensFacts, str, list[str]]:
+    """Orientation (1 to 8), what is known of the lens, the XMP packet, and notes."""
     exif = _exif(image)
     value = 1 if exif is None else exif.get(_EXIF_ORIENTATION, 1)
-    return value if value in range(1, 9) else 1
+    orientation = value if isinstance(value, int) and value in _TURNS else 1
+    packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    if isinstance(packet, bytes):
+        packet = packet[:_LARGEST_XMP].decode("utf-8", "ignore")
+    xmp = packet if isinstance(packet, str) else ""
+    height, width = _upright_size(image, orientation)
+    lens, notes = read_lens(exif, xmp, height=height, width=width, turned=orientation >= 5)
+    return orientation, lens, xmp, notes
 
 
-def _upright(image: Image.Image) -> Image.Image:
-    turned = ImageOps.exif_transpose(image) if _orientation(image) != 1 else None
-    return image if turned is None else turned
+def _upright_size(image: Image.Image, orientation: int) -> tuple[int, int]:
+    # The last four orientations swap the axes.
+    return (image.width, image.height) if orientation >= 5 else (image.height, image.width)
 
 
-def _focal_35mm(image: Image.Image) -> float | None:
-    exif = _exif(image)
-    if exif is None:
-        return None
-    try:
-        value = float(exif.get_ifd(_EXIF_IFD).get(_EXIF_FOCAL_35MM, 0))
-    except _DECODE_ERRORS:
-        return None
-    return value if 1.0 <= value <= 2000.0 else None  # 0 means unknown
-
-
-def _rgb_pixels(image: Image.Image, where: str | Path) -> Pixels:
-    if image.mode.startswith("I") or image.mode == "F":
-        return _grey_from_wide(np.asarray(image), image.mode, where)
-    if image.mode in _ALPHA_MODES or "transparency" in image.info:
-        with_alpha = image.convert("RGBA")
-        backdrop = Image.new("RGBA", with_alpha.size, (0, 0, 0, 255))
-        image = Image.alpha_composite(backdrop, with_alpha)
-    return np.array(image.convert("RGB"), dtype=np.uint8)
-
-
-def _grey_from_wide(values: npt.NDArray[Any], mode: str, where: str | Path) -> Pixels:
-    wide = values.astype(np.float64)
-    top = 1.0 if mode == "F" else 65535.0
-    low, high = float(wide.min()), float(wide.max())
-    if not (low >= 0 and high <= top):  # also catches NaN
-        raise UserError(
-            f"holds samples from {low:g} to {high:g}, expected 0 to {top:g}",
-            where=where,
-            fix="save it as an 8- or 16-bit picture",
-        )
-    grey = np.floor(wide / top * 255 + 0.5).astype(np.uint8)
-    return np.repeat(grey[:, :, None], 3, axis=2)
+@contextlib.contextmanager
+def _quiet(file_format: str) -> Iterator[None]:
+    """Keep decoders from printing: what is wrong with a file is said once, in one line."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if file_format not in ("TIFF", "PNG"):
+            yield
+            return
+        # The libraries behind Pillow and OpenCV write to the file descriptor, past Python.
+        kept = os.dup(2)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(nowhere, 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(nowhere)

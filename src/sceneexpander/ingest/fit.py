@@ -10,9 +10,12 @@ from PIL import Image
 
 from sceneexpander.artifacts.views import Affine
 from sceneexpander.ingest.config import Fit
-from sceneexpander.ingest.decode import Pixels
+from sceneexpander.ingest.samples import Mask, Pixels
 
 PAD_GREY = 128
+_SUPPORT = 4  # pixels of the result beyond a border that the resampling filter can reach (three for Lanczos)
+_ROUNDING = 1e-9
+_NEARLY_WHITE = 253
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,12 +34,16 @@ class FrameSize:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedPicture:
-    """A picture in the common frame. ``kept`` is the share of the original's area that is still visible."""
+    """A picture in the common frame. ``kept`` is the share of the original's area that is still visible.
+
+    ``valid`` are the stored pixels that show the picture, and only such parts of it as show something; None: all.
+    """
 
     image: Pixels
     detail: Pixels
     stored_from_original: Affine
     kept: float
+    valid: Mask | None = None
 
 
 def common_frame(
@@ -68,43 +75,107 @@ def _scale(original: tuple[int, int], stored: tuple[int, int], fit: Fit) -> floa
     return max(ratios) if fit == "crop" else min(ratios)
 
 
-def fit_picture(pixels: Pixels, frame: FrameSize, fit: Fit = "crop") -> FittedPicture:
+def fit_picture(pixels: Pixels, frame: FrameSize, fit: Fit = "crop", *, valid: Mask | None = None) -> FittedPicture:
     """Scale (one factor for both axes, antialiased) and centre a picture in the frame.
 
     ``crop`` covers the frame and cuts off what protrudes; ``pad`` shows all of the picture on neutral grey. ``stored_from_original``
     maps corner-origin pixel coordinates exactly: the resampled window is placed at fractions of a pixel, nothing is rounded.
+
+    Args:
+        pixels: (H, W, 3) of the original.
+        frame: the common frame.
+        fit: see above.
+        valid: (H, W) which pixels of the original show something; None: all.
     """
     original_height, original_width = pixels.shape[:2]
     scale = _scale((original_height, original_width), (frame.height, frame.width), fit)
     window_height, window_width = frame.height / scale, frame.width / scale
     left, top = (original_width - window_width) / 2, (original_height - window_height) / 2
-    canvas, offset_y, offset_x = _padded(pixels, top, left)
-    box = (
-        max(0.0, left + offset_x),
-        max(0.0, top + offset_y),
-        min(float(canvas.shape[1]), left + offset_x + window_width),
-        min(float(canvas.shape[0]), top + offset_y + window_height),
-    )
-    source = Image.fromarray(canvas)
     visible = min(window_height, original_height) * min(window_width, original_width)
+    source = Image.fromarray(pixels)
+    place = _Place(frame=frame, scale=scale, left=left, top=top)
+    border = left < -_ROUNDING or top < -_ROUNDING
+    mask = valid
+    if mask is None and border:
+        mask = np.ones((original_height, original_width), dtype=np.bool_)
     return FittedPicture(
-        image=_resampled(source, frame.width, frame.height, box),
-        detail=_resampled(source, frame.detail_width, frame.detail_height, box),
+        image=_resampled(source, place, frame.height, frame.width, PAD_GREY),
+        detail=_resampled(source, place, frame.detail_height, frame.detail_width, PAD_GREY),
         stored_from_original=((scale, 0.0, -left * scale), (0.0, scale, -top * scale)),
         kept=visible / (original_height * original_width),
+        valid=None if mask is None else _fitted_mask(mask, place),
     )
 
 
-def _padded(pixels: Pixels, top: float, left: float) -> tuple[Pixels, int, int]:
-    """The picture on a canvas that the (possibly protruding) window fits into, and where it lies on it."""
-    offset_y, offset_x = (max(0, math.ceil(-start - 1e-9)) for start in (top, left))
-    if not (offset_y or offset_x):
-        return pixels, 0, 0
-    height, width = pixels.shape[:2]
-    canvas = np.full((height + 2 * offset_y, width + 2 * offset_x, 3), PAD_GREY, dtype=np.uint8)
-    canvas[offset_y : offset_y + height, offset_x : offset_x + width] = pixels
-    return canvas, offset_y, offset_x
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Place:
+    """Where the frame lies on an original: its corner, in original pixels (negative: beside the picture), and stored per original pixel."""
+
+    frame: FrameSize
+    scale: float
+    left: float
+    top: float
 
 
-def _resampled(source: Image.Image, width: int, height: int, box: tuple[float, float, float, float]) -> Pixels:
-    return np.array(source.resize((width, height), resample=Image.Resampling.LANCZOS, box=box), dtype=np.uint8)
+def _fitted_mask(valid: Mask, place: _Place) -> Mask | None:
+    grey = Image.fromarray(valid.astype(np.uint8) * 255)
+    # A stored pixel is valid if next to nothing that it is made of is not.
+    fitted = (
+        _resampled(grey, place, place.frame.height, place.frame.width, 0, Image.Resampling.BILINEAR) >= _NEARLY_WHITE
+    )
+    return None if bool(fitted.all()) else fitted
+
+
+def _resampled(
+    source: Image.Image,
+    place: _Place,
+    height: int,
+    width: int,
+    ground: int,
+    resample: Image.Resampling = Image.Resampling.LANCZOS,
+) -> Pixels:
+    """The frame's view of ``source`` at a size, with ``ground`` where there is no picture."""
+    factor = height / place.frame.height * place.scale  # pixels of the result per original pixel
+    rows = _covered(place.top, source.height, factor, height)
+    columns = _covered(place.left, source.width, factor, width)
+    box = (
+        place.left + columns[0] / factor,
+        place.top + rows[0] / factor,
+        place.left + columns[1] / factor,
+        place.top + rows[1] / factor,
+    )
+    canvas, offset = _padded(source, box, ground)
+    shifted = (
+        max(0.0, box[0] + offset[0]),
+        max(0.0, box[1] + offset[1]),
+        min(float(canvas.width), box[2] + offset[0]),
+        min(float(canvas.height), box[3] + offset[1]),
+    )
+    part = canvas.resize((columns[1] - columns[0], rows[1] - rows[0]), resample=resample, box=shifted)
+    if rows == (0, height) and columns == (0, width):
+        return np.array(part, dtype=np.uint8)
+    shape = (height, width, 3) if len(source.getbands()) == 3 else (height, width)
+    result = np.full(shape, ground, dtype=np.uint8)
+    result[rows[0] : rows[1], columns[0] : columns[1]] = np.asarray(part)
+    return result
+
+
+def _covered(start: float, length: int, factor: float, size: int) -> tuple[int, int]:
+    """The rows (or columns) of the result that the picture reaches, with the filter's support: the others are ground alone."""
+    first = math.floor(-start * factor) - _SUPPORT
+    last = math.ceil((length - start) * factor) + _SUPPORT
+    return max(0, min(first, size - 1)), min(size, max(last, 1))
+
+
+def _padded(
+    source: Image.Image, box: tuple[float, float, float, float], ground: int
+) -> tuple[Image.Image, tuple[int, int]]:
+    """The picture on a canvas that the (possibly protruding) box fits into, and where it lies on it."""
+    left, above = (max(0, math.ceil(-start - _ROUNDING)) for start in box[:2])
+    right, below = (max(0, math.ceil(end - size - _ROUNDING)) for end, size in zip(box[2:], source.size, strict=True))
+    if not any((left, above, right, below)):
+        return source, (0, 0)
+    size = (source.width + left + right, source.height + above + below)
+    canvas = Image.new(source.mode, size, (ground,) * len(source.getbands()) if len(source.getbands()) > 1 else ground)
+    canvas.paste(source, (left, above))
+    return canvas, (left, above)

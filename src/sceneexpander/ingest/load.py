@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,29 +13,40 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.artifacts.scene import RoundSpec, Scene
-from sceneexpander.artifacts.views import ViewRecord, ViewSet
-from sceneexpander.errors import UserError, did_you_mean
-from sceneexpander.ingest.config import IngestConfig
-from sceneexpander.ingest.decode import Picture, Pixels, read_picture, read_picture_shape
-from sceneexpander.ingest.fit import FittedPicture, common_frame, fit_picture
-from sceneexpander.ingest.listing import list_pictures, require_inside, safe_name
-from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file
+from sceneexpander.artifacts.views import LensFacts, ViewRecord, ViewSet, to_uint8
+from sceneexpander.errors import UserError, did_you_mean, printable
+from sceneexpander.ingest.bars import Bars, find_bars, find_overlay
+from sceneexpander.ingest.config import Fit, IngestConfig
+from sceneexpander.ingest.copies import Thumbnail, is_copy, thumbnail
+from sceneexpander.ingest.decode import Picture, pixel_digest, read_picture, read_picture_header
+from sceneexpander.ingest.fit import FittedPicture, FrameSize, common_frame, fit_picture
+from sceneexpander.ingest.links import require_inside
+from sceneexpander.ingest.listing import safe_name
+from sceneexpander.ingest.panorama import (
+    MARKED_PANORAMA,
+    doubtful_shape,
+    is_marked_panorama,
+    panorama_reason,
+    strip_reason,
+)
+from sceneexpander.ingest.samples import Mask, Pixels
+from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file, same_name
+from sceneexpander.ingest.survey import survey_pictures
+from sceneexpander.plainfiles import require_folder
 
 logger = logging.getLogger(__name__)
 
+SMALLEST_SIDE_PX = 32
+_MANY = 4  # photos with the same note share one line
+_CONSTANT_SPREAD = 2.0  # grey levels: below it a picture shows nothing
 LITTLE_KEPT = 0.6  # share of a picture's area: losing more than the rest is worth a remark
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadedViews:
-    """Captured views with what else the files told.
-
-    ``exif_focal_px`` is the focal length in *stored* pixels from EXIF (a hint only: cropped or edited photos keep a wrong value), or None.
-    ``notes`` says what was noticed: duplicates left out, much cut off.
-    """
+    """Captured views, and what was noticed: files and photos left out, parts not used, samples and profiles taken in some way."""
 
     views: ViewSet
-    exif_focal_px: tuple[float | None, ...]
     notes: tuple[str, ...]
 
 
@@ -51,12 +61,12 @@ def load_scene(folder: Path, config: IngestConfig, *, name: str | None = None) -
     Raises:
         UserError: one line for each way in which the folder, ``scene.yaml`` or a photo is unusable.
     """
-    if not folder.is_dir():
-        raise UserError("is not a scene folder" if folder.exists() else "does not exist", where=folder)
+    require_folder(folder, expected="a scene folder")
     facts = read_scene_file(folder)
     images = require_inside(folder / facts.images, folder, where=f"{folder / SCENE_FILE}: 'images'")
-    paths = _ordered(list_pictures(images, inside=folder), facts.order, folder / SCENE_FILE)
-    return _scene(paths, facts.rounds, config, name or facts.name or folder.resolve().name)
+    survey = survey_pictures(images, inside=folder)
+    paths = _ordered(list(survey.pictures), facts.order, folder / SCENE_FILE)
+    return _scene(paths, survey.notes, facts.rounds, config, name or facts.name or folder.resolve().name)
 
 
 def load_photos(folder: Path, rounds: Sequence[RoundSpec], config: IngestConfig, *, name: str | None = None) -> Scene:
@@ -67,48 +77,156 @@ def load_photos(folder: Path, rounds: Sequence[RoundSpec], config: IngestConfig,
     """
     if not rounds:
         raise UserError("has no prompt", where=folder, fix="pass the sentence that says what to add")
-    return _scene(list_pictures(folder), tuple(rounds), config, name or folder.resolve().name)
+    survey = survey_pictures(folder)
+    return _scene(list(survey.pictures), survey.notes, tuple(rounds), config, name or folder.resolve().name)
 
 
-def read_views(paths: Sequence[Path], config: IngestConfig) -> LoadedViews:
+def read_views(paths: Sequence[Path], config: IngestConfig, *, noticed: Sequence[str] = ()) -> LoadedViews:
     """Read, check and fit captured photos. The first one decides the common aspect ratio.
 
-    Photos with exactly the same pixels as an earlier one are left out and noted: a view without a baseline tells geometry nothing.
+    Left out, with a note: panoramas and strips, which no pinhole camera took; photos that are the same picture as an earlier one, to the
+    pixel or saved again, because a view without a baseline tells geometry nothing. Not valid in the result: what is transparent, the
+    border of ``fit=pad``, bars of one colour, and strips that are the same in all photos.
+
+    Args:
+        paths: the photos, in order.
+        config: stored size and limits.
+        noticed: notes that come first.
 
     Raises:
         UserError: a photo is unusable, or there are too few or too many.
     """
+    notes = list(noticed)
     _check_count(len(paths), paths, config)
-    limit = config.max_megapixels
+    usable, frame = _usable(paths, config, notes)
+    parts: list[ViewSet] = []
+    seen: list[_Seen] = []
+    for path in usable:  # one at a time: thirty camera originals at once would not fit in memory
+        picture = read_picture(path, max_megapixels=config.max_megapixels)
+        shown = printable(picture.name)
+        reason = _nothing_to_see(picture.pixels) or panorama_reason(
+            picture.pixels, picture.xmp, has_lens=_knows_lens(picture.lens)
+        )
+        if reason is not None:
+            notes.append(f"{shown}: {reason}; left out")
+            continue
+        this = _Seen(name=shown, digest=pixel_digest(picture), small=thumbnail(picture.pixels), shape=picture.shape)
+        twin = next((other for other in seen if other.same_picture(this)), None)
+        if twin is not None:
+            same = "shows the same pixels as" if twin.digest == this.digest else "is the same picture, saved again, as"
+            notes.append(f"{shown}: {same} {twin.name}, left out and counted once")
+            continue
+        seen.append(this)
+        remarks = [*picture.notes, doubtful_shape(picture.height, picture.width, has_lens=_knows_lens(picture.lens))]
+        notes += [f"{shown}: {note}" for note in remarks if note is not None]
+        parts.append(_fitted_view(picture, frame, config.fit, len(parts), notes))
+    _check_count(len(parts), paths, config, distinct=" different", notes=notes[len(noticed) :])
+    views = parts[0]
+    for part in parts[1:]:
+        views = views.append(part)
+    if len({this.shape for this in seen}) == 1:
+        views = _without_overlay(views, notes)
+    return LoadedViews(views=views, notes=_gathered(notes))
+
+
+def _gathered(notes: Sequence[str]) -> tuple[str, ...]:
+    """Notes of many photos that say the same as one note each."""
+    names: dict[str, list[str]] = {}
+    for note in notes:
+        name, colon, text = note.partition(": ")
+        names.setdefault(text if colon else note, []).append(name if colon else "")
+    gathered = []
+    for text, those in names.items():
+        if len(those) >= _MANY:
+            gathered.append(f"{len(those)} photos ({', '.join(those[:3])}, ...): {text}")
+        else:
+            gathered += [f"{name}: {text}" if name else text for name in those]
+    return tuple(gathered)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Seen:
+    """What is kept of a photo to recognise it again."""
+
+    name: str
+    digest: str
+    small: Thumbnail
+    shape: tuple[int, int]
+
+    def same_picture(self, other: _Seen) -> bool:
+        aspects = (self.shape[1] / self.shape[0], other.shape[1] / other.shape[0])
+        return self.digest == other.digest or is_copy(self.small, other.small, aspects=aspects)
+
+
+def _usable(paths: Sequence[Path], config: IngestConfig, notes: list[str]) -> tuple[list[Path], FrameSize]:
+    """The photos that a pinhole camera may have taken, by their headers, and the frame for them."""
+    usable, sizes = [], []
+    for path in paths:
+        header = read_picture_header(path, max_megapixels=config.max_megapixels)
+        reason = strip_reason(header.height, header.width)
+        if reason is None and is_marked_panorama(header.xmp):
+            reason = MARKED_PANORAMA
+        if reason is not None:
+            notes.append(f"{printable(path.name)}: {reason}; left out")
+            continue
+        usable.append(path)
+        sizes.append((header.height, header.width))
+    _check_count(len(usable), paths, config, distinct=" usable", notes=notes)
     frame = common_frame(
-        [read_picture_shape(path, max_megapixels=limit) for path in paths],
+        sizes,
         long_side_px=config.long_side_px,
         multiple=config.multiple,
         detail_scale=config.detail_scale,
         fit=config.fit,
     )
-    parts: list[ViewSet] = []
-    focals: list[float | None] = []
-    notes: list[str] = []
-    names: dict[str, str] = {}  # by digest of the pixels
-    for path in paths:  # one at a time: thirty camera originals at once would not fit in memory
-        picture = read_picture(path, max_megapixels=limit)
-        first_name = names.setdefault(_pixel_digest(picture), picture.name)
-        if first_name != picture.name:
-            notes.append(f"{picture.name}: shows the same pixels as {first_name}, left out")
-            continue
-        view_id = f"{len(parts):03d}_{safe_name(Path(picture.name).stem)}"
-        fitted = fit_picture(picture.pixels, frame, config.fit)
-        if fitted.kept < LITTLE_KEPT:
-            notes.append(f"{picture.name}: only {fitted.kept:.0%} of it fits the frame of the first view")
-        parts.append(view_from_fitted(picture, fitted, view_id=view_id))
-        scale = parts[-1].records[0].stored_from_original[0][0]
-        focals.append(None if picture.exif_focal_px is None else picture.exif_focal_px * scale)
-    _check_count(len(parts), paths, config, distinct=" different")
-    views = parts[0]
-    for part in parts[1:]:
-        views = views.append(part)
-    return LoadedViews(views=views, exif_focal_px=tuple(focals), notes=tuple(notes))
+    return usable, frame
+
+
+def _nothing_to_see(pixels: Pixels) -> str | None:
+    if min(pixels.shape[:2]) < SMALLEST_SIDE_PX:
+        return f"has only {pixels.shape[1]} x {pixels.shape[0]} pixels"
+    return "shows a single colour" if is_single_colour(pixels) else None
+
+
+def is_single_colour(pixels: Pixels) -> bool:
+    """Whether a picture shows nothing at all."""
+    spread = pixels.reshape(-1, 3)[:: max(1, pixels.shape[0] * pixels.shape[1] // 10**6)].std(axis=0)
+    return float(spread.max()) < _CONSTANT_SPREAD
+
+
+def _knows_lens(lens: LensFacts) -> bool:
+    return lens.focal_mm is not None or lens.focal_px is not None
+
+
+def _fitted_view(picture: Picture, frame: FrameSize, fit: Fit, index: int, notes: list[str]) -> ViewSet:
+    shown = printable(picture.name)
+    bars = find_bars(picture.pixels)
+    if bars:
+        notes.append(f"{shown}: has bars of one colour ({bars.words(*picture.shape)}), not used")
+    fitted = fit_picture(picture.pixels, frame, fit, valid=without_bars(picture, bars))
+    if fitted.kept < LITTLE_KEPT:
+        notes.append(f"{shown}: only {fitted.kept:.0%} of it fits the frame of the first view")
+    return view_from_fitted(picture, fitted, view_id=f"{index:03d}_{safe_name(Path(picture.name).stem)}")
+
+
+def without_bars(picture: Picture, bars: Bars) -> Mask | None:
+    """Which pixels of a picture show something, less its bars; None: all."""
+    if not bars:
+        return picture.valid
+    inside = bars.mask(*picture.shape)
+    return inside if picture.valid is None else picture.valid & inside
+
+
+def _without_overlay(views: ViewSet, notes: list[str]) -> ViewSet:
+    validity = views.validity().numpy()
+    shown = views.validity().any(dim=0).numpy()
+    overlay = find_overlay([to_uint8(image) for image in views.images], shown)
+    if not overlay:
+        return views
+    notes.append(
+        f"the same strip at the border of all photos ({overlay.words(views.height, views.width)}): an overlay, not used"
+    )
+    return replace(views, valid=torch.from_numpy(validity & overlay.mask(views.height, views.width)))
 
 
 def view_from_fitted(
@@ -124,9 +242,13 @@ def view_from_fitted(
         stored_from_original=fitted.stored_from_original,
         generated=generated,
         round=round_number,
+        lens=picture.lens,
     )
     return ViewSet(
-        records=(record,), images=image_tensor(fitted.image)[None], detail_images=image_tensor(fitted.detail)[None]
+        records=(record,),
+        images=image_tensor(fitted.image)[None],
+        detail_images=image_tensor(fitted.detail)[None],
+        valid=None if fitted.valid is None else torch.from_numpy(fitted.valid)[None],
     )
 
 
@@ -135,29 +257,42 @@ def image_tensor(pixels: Pixels) -> Float[Tensor, "3 height width"]:
     return torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1).to(torch.float32) / 255
 
 
-def _scene(paths: list[Path], rounds: tuple[RoundSpec, ...], config: IngestConfig, name: str) -> Scene:
-    loaded = read_views(paths, config)
+def _scene(
+    paths: list[Path], noticed: Sequence[str], rounds: tuple[RoundSpec, ...], config: IngestConfig, name: str
+) -> Scene:
+    loaded = read_views(paths, config, noticed=noticed)
     for note in loaded.notes:
         logger.warning("%s", note)
-    return Scene(name=safe_name(name, fallback="scene"), views=loaded.views, rounds=rounds)
+    return Scene(name=safe_name(name, fallback="scene"), views=loaded.views, rounds=rounds, notes=loaded.notes)
 
 
 def _ordered(paths: list[Path], order: tuple[str, ...], scene_file: Path) -> list[Path]:
     by_name = {path.name: path for path in paths}
+    alike = {same_name(path.name): path.name for path in paths}
+    first: list[str] = []
     for name in order:
-        if name not in by_name:
+        found = name if name in by_name else alike.get(same_name(name))
+        if found is None:
             raise UserError(
                 f"'order' names {name!r}, which is not there", where=scene_file, fix=did_you_mean(name, by_name)
             )
-    return [by_name[name] for name in order] + [path for path in paths if path.name not in order]
+        first.append(found)
+    return [by_name[name] for name in first] + [path for path in paths if path.name not in first]
 
 
-def _check_count(count: int, paths: Sequence[Path], config: IngestConfig, *, distinct: str = "") -> None:
+def _check_count(
+    count: int, paths: Sequence[Path], config: IngestConfig, *, distinct: str = "", notes: Sequence[str] = ()
+) -> None:
     where = paths[0].parent if paths else None
     needed = 1 if config.allow_single_view else 2
     if count < needed:
+        # What was left out is the reason, so it belongs into the line.
+        left_out = [note for note in notes if "left out" in note]
+        because = (
+            f" ({left_out[0]}{f', and {len(left_out) - 1} more' if len(left_out) > 1 else ''})" if left_out else ""
+        )
         raise UserError(
-            f"holds only {count}{distinct} picture{'s' * (count != 1)}, {needed} or more are needed",
+            f"holds only {count}{distinct} picture{'s' * (count != 1)}, {needed} or more are needed{because}",
             where=where,
             fix="add photos of the same place from other positions",
         )
@@ -167,9 +302,3 @@ def _check_count(count: int, paths: Sequence[Path], config: IngestConfig, *, dis
             where=where,
             fix="remove some or raise max_views",
         )
-
-
-def _pixel_digest(picture: Picture) -> str:
-    # Pixels, not files: the same photo saved with other metadata is still the same photo.
-    shape = f"{picture.height}x{picture.width}:".encode()
-    return hashlib.sha256(shape + picture.pixels.tobytes()).hexdigest()

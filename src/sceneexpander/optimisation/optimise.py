@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
@@ -63,6 +63,7 @@ def optimise(
     *,
     method: str,
     seed: int,
+    valid: Bool[Tensor, "view height width"] | None = None,
     device: torch.device | str = "cpu",
     checkpoint_folder: Path | None = None,
     on_step: Callable[[int, float], None] | None = None,
@@ -77,6 +78,7 @@ def optimise(
         config: settings.
         method: name of the result.
         seed: of every random draw.
+        valid: pixels that show the place; the others count nothing. None: all.
         device: where to work.
         checkpoint_folder: resume points; None: none are kept.
         on_step: told the number of finished steps and the last loss.
@@ -89,7 +91,7 @@ def optimise(
         raise ValueError(
             problem or f"pictures of {tuple(images.shape)} do not fit depths of {tuple(start.depth.shape)}"
         )
-    run = _Run(start, images, config, seed=seed, device=torch.device(device))
+    run = _Run(start, images, config, valid=valid, seed=seed, device=torch.device(device))
     first = run.resume(checkpoint_folder)
     if first:
         _log.info("resumed the optimisation after step %d", first)
@@ -111,11 +113,13 @@ class _Run:
         images: Float[Tensor, "view 3 height width"],
         config: OptimiseConfig,
         *,
+        valid: Bool[Tensor, "view height width"] | None,
         seed: int,
         device: torch.device,
     ) -> None:
         self._start, self._config, self._seed, self._device = start, config, seed, device
         self._images = images.to(device)
+        self._weights = None if valid is None else valid.to(device, images.dtype)
         self._intrinsics = start.intrinsics_px.to(device)
         self._views = start.posed.nonzero()[:, 0].tolist()
         self._extent = scene_extent(start)
@@ -124,7 +128,7 @@ class _Run:
         self._cameras = RefinedCameras(start.world_from_cam.to(device), rate=config.rates.poses, extent=self._extent)
         self._density = density_control(config, extent=self._extent, device=device)
         self.losses: list[float] = []
-        self._key = _run_key(start, images, config, seed)
+        self._key = _run_key(start, images, valid, config, seed)
 
     def step(self, step: int) -> float:
         """One view, one update."""
@@ -146,7 +150,8 @@ class _Run:
             screen_offsets=offsets,
             with_depth=False,
         )
-        loss = photometric_loss(seen.rgb[0], self._images[view], self._config.ssim_weight)
+        weights = None if self._weights is None else self._weights[view]
+        loss = photometric_loss(seen.rgb[0], self._images[view], self._config.ssim_weight, weights)
         (loss + self._density.penalty(splats)).backward()  # type: ignore[no-untyped-call]
         assert offsets.grad is not None  # noqa: S101 - every picture depends on them
         facts = Seen(centre_gradient=offsets.grad[0], radius_px=seen.radius_px[0], height=height, width=width)
@@ -244,8 +249,9 @@ def density_control(config: OptimiseConfig, *, extent: float, device: torch.devi
     return CloneAndSplit(config.density, config.steps, extent=extent)
 
 
-def _run_key(start: Reconstruction, images: Tensor, config: OptimiseConfig, seed: int) -> str:
+def _run_key(start: Reconstruction, images: Tensor, valid: Tensor | None, config: OptimiseConfig, seed: int) -> str:
     digest = hashlib.sha256(f"{config!r}:{seed}".encode())
-    for value in (images, start.gaussians.means, start.gaussians.sh, start.world_from_cam):
+    given = (images, start.gaussians.means, start.gaussians.sh, start.world_from_cam)
+    for value in given if valid is None else (*given, valid):
         digest.update(value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -58,6 +58,26 @@ def test_a_damaged_picture_costs_what_it_must() -> None:
     assert rows[1].psnr_db == PSNR_CAP_DB
 
 
+def test_pixels_that_do_not_show_the_place_count_in_no_number() -> None:
+    scene = made_reconstruction()
+    views = own_pictures(scene)
+    images = views.images.clone()
+    images[:, :, : HEIGHT // 4] = 0.5  # a bar
+    valid = torch.ones(len(views), HEIGHT, WIDTH, dtype=torch.bool)
+    valid[:, : HEIGHT // 4 + 5] = False  # and the windows that reach into it
+    barred = dataclasses.replace(views, images=images)
+    masked = dataclasses.replace(barred, valid=valid)
+    for got in (*preservation(scene, masked, CONFIG), *insertion_fidelity(scene, masked, CONFIG)):
+        assert got.psnr_db == PSNR_CAP_DB
+        assert got.ssim == pytest.approx(1, abs=1e-9)
+        assert got.coverage > 0.95
+    assert all(row.psnr_db < 30 for row in preservation(scene, barred, CONFIG))
+    # A hole below the bar is not seen either.
+    half = scene.gaussians.select(scene.gaussians.means[:, 1] > scene.gaussians.means[:, 1].quantile(0.3))
+    holed = dataclasses.replace(scene, gaussians=half)
+    assert preservation(holed, masked, CONFIG)[0].coverage > preservation(holed, barred, CONFIG)[0].coverage + 0.1
+
+
 def test_ghosting_is_noticed_only_by_the_cross_view_number() -> None:
     """Shifted copies behind each view's own surface leave the view itself nearly untouched."""
     good = made_reconstruction(generated_last=False)

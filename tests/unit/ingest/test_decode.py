@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
 from sceneexpander.errors import UserError
@@ -110,21 +113,56 @@ def test_grey_and_bilevel() -> None:
     assert set(np.unique(decode(encoded(bilevel, "PNG")))) == {0, 255}
 
 
-@pytest.mark.parametrize("mode", ["LA", "RGBA"])
-def test_transparency_goes_over_black(mode: str) -> None:
-    rgba = np.full((20, 30, 4), 255, np.uint8)
-    rgba[:, :10, 3], rgba[:, 10:20, 3] = 0, 128
-    found = decode(encoded(Image.fromarray(rgba).convert(mode), "PNG"))
-    assert (found[:, :10] == 0).all()
-    assert np.abs(found[:, 10:20].astype(int) - 128).max() <= 1
-    assert (found[:, 20:] == 255).all()
+@pytest.mark.parametrize(
+    ("mode", "fmt"), [("LA", "PNG"), ("RGBA", "PNG"), ("RGBA", "TIFF"), ("RGBA", "WEBP"), ("LA", "TIFF")]
+)
+def test_transparent_pixels_are_not_valid(mode: str, fmt: str) -> None:
+    rgba = np.full((20, 30, 4), 200, np.uint8)
+    rgba[:, :10, 3], rgba[:, 10:20, 3], rgba[:, 20:, 3] = 0, 128, 255
+    options = {"lossless": True, "exact": True} if fmt == "WEBP" else {}
+    picture = decode_picture(encoded(Image.fromarray(rgba).convert(mode), fmt, **options), name="x", where="x")
+    assert picture.valid is not None
+    assert not picture.valid[:, :10].any()
+    assert picture.valid[:, 10:].all()
+    # Colours are what was painted: no ground shines through, whatever the opacity.
+    assert (picture.pixels[:, 10:] == 200).all()
+    assert "33% of it is transparent" in picture.notes[0]
+
+
+@pytest.mark.parametrize("alpha", [255, 128, 3])
+def test_even_opacity_hides_nothing(alpha: int) -> None:
+    rgba = np.dstack([quadrants(), np.full((40, 60), alpha, np.uint8)])
+    picture = decode_picture(encoded(Image.fromarray(rgba), "PNG"), name="x", where="x")
+    assert picture.valid is None
+    assert np.array_equal(picture.pixels, quadrants())
+    assert len(picture.notes) == (alpha < 255)
+
+
+def test_nothing_but_transparency_is_refused() -> None:
+    assert "transparent nearly everywhere" in error_line(
+        encoded(Image.fromarray(np.zeros((20, 30, 4), np.uint8)), "PNG")
+    )
+
+
+def test_masks_turn_with_their_pictures() -> None:
+    rgba = np.dstack([quadrants(), np.where(np.arange(60) < 20, 0, 255).astype(np.uint8)[None].repeat(40, 0)])
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    picture = decode_picture(encoded(Image.fromarray(rgba), "PNG", exif=exif.tobytes()), name="x", where="x")
+    assert picture.valid is not None
+    assert picture.valid.shape == picture.shape == (60, 40)
+    assert not picture.valid[:20].any()
+    assert picture.valid[20:].all()
 
 
 def test_palette_with_a_transparent_entry() -> None:
     palette = Image.fromarray(quadrants()).quantize(4)
     index = palette.getpixel((0, 0))
-    found = corners(decode(encoded(palette, "PNG", transparency=index)))
-    assert found == [(0, 0, 0), GREEN, BLUE, WHITE]
+    picture = decode_picture(encoded(palette, "PNG", transparency=index), name="x", where="x")
+    assert corners(picture.pixels) == [(0, 0, 0), GREEN, BLUE, WHITE]
+    assert picture.valid is not None
+    assert not picture.valid[:20, :30].any()
+    assert picture.valid[20:].all()
 
 
 def test_cmyk_jpeg_has_the_right_colours() -> None:
@@ -140,21 +178,159 @@ def test_16_bit_grey_is_scaled_not_clipped(fmt: str) -> None:
     assert np.array_equal(found[0, :, 0], np.arange(256))  # 65535 / 255 = 257 exactly
 
 
-def test_16_bit_rgb_png_is_scaled() -> None:
-    ramp = (np.arange(256, dtype=">u2") * 257)[None, :, None].repeat(3, 2).repeat(2, 0)
-    rows = b"".join(b"\0" + row.tobytes() for row in ramp)
-    header = struct.pack(">IIBBBBB", 256, 2, 16, 2, 0, 0, 0)
+def png_16(samples: np.ndarray, *chunks: tuple[bytes, bytes]) -> bytes:
+    """A PNG of 16-bit colour samples (H, W, 3) or grey ones (H, W)."""
+    height, width = samples.shape[:2]
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in samples)
+    header = struct.pack(">IIBBBBB", width, height, 16, 2 if samples.ndim == 3 else 0, 0, 0, 0)
     data = b"\x89PNG\r\n\x1a\n"
-    for kind, body in ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")):
+    for kind, body in ((b"IHDR", header), *chunks, (b"IDAT", zlib.compress(rows)), (b"IEND", b"")):
         data += struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-    assert np.array_equal(decode(data)[0, :, 1], np.arange(256))
+    return data
 
 
-def test_float_tiff() -> None:
-    ramp = np.tile(np.linspace(0, 1, 256, dtype=np.float32), (4, 1))
-    assert np.array_equal(decode(encoded(Image.fromarray(ramp), "TIFF"))[0, :, 0], np.arange(256))
-    assert "from 0 to 40" in error_line(encoded(Image.fromarray(ramp * 40), "TIFF"))
-    assert "nan" in error_line(encoded(Image.fromarray(ramp * np.float32(np.nan)), "TIFF"))
+def tiff(samples: np.ndarray, **options: object) -> bytes:
+    buffer = io.BytesIO()
+    kind = "rgb" if samples.ndim == 3 else "minisblack"
+    tifffile.imwrite(buffer, samples, photometric=kind, **options)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+@pytest.mark.parametrize("kind", [png_16, tiff])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_samples_are_scaled_by_the_depth_they_use(bits: int, kind: Callable[..., bytes], channels: int) -> None:
+    top = 2**bits - 1
+    ramp = np.rint(np.linspace(0, top, 256)).astype(np.uint16)[None].repeat(40, 0)
+    samples = ramp if channels == 1 else np.stack([ramp, ramp // 2, ramp // 4], -1)
+    picture = decode_picture(kind(samples), name="x", where="x")
+    assert np.abs(picture.pixels[0, :, 0].astype(int) - np.arange(256)).max() <= 1
+    if channels == 3:
+        assert np.abs(picture.pixels[0, :, 2].astype(int) - np.arange(256) // 4).max() <= 1
+    assert [f"{bits}-bit" in note for note in picture.notes] == ([True] if bits < 16 else [])
+
+
+def test_what_a_file_says_of_its_depth_counts_more_than_its_brightest_sample() -> None:
+    dark = np.linspace(0, 4000, 256).astype(np.uint16)[None, :, None].repeat(40, 0).repeat(3, 2)
+    assert decode(png_16(dark, (b"sBIT", bytes([16, 16, 16])))).max() == round(4000 / 257)
+    assert decode(tiff(dark, extratags=[(281, "H", 3, (65535,) * 3, True)])).max() == round(4000 / 257)
+    assert decode(tiff(dark // 2, extratags=[(281, "H", 3, (4095,) * 3, True)])).max() == round(2000 * 255 / 4095)
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("length", [0xFFFFFFF0, 0x7FFFFFFF, 10**6])
+def test_chunks_that_announce_more_than_there_is_cost_nothing(length: int, capfd: pytest.CaptureFixture[str]) -> None:
+    data = bytearray(png_16(quadrants().astype(np.uint16) * 257, (b"tEXt", b"a\0b")))
+    start = data.index(b"tEXt")
+    data[start - 4 : start] = struct.pack(">I", length)
+    assert "damaged" in error_line(bytes(data))
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("orientation", sorted(STORED))
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_tiff_is_turned_whatever_its_samples(orientation: int, dtype: type) -> None:
+    top = {np.uint8: 1, np.uint16: 257, np.float32: 1 / 255}[dtype]
+    stored = np.ascontiguousarray((STORED[orientation](quadrants()) * np.float64(top)).astype(dtype))
+    data = tiff(stored, extratags=[(274, "H", 1, orientation, True)])
+    assert np.array_equal(decode(data), quadrants())
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_floating_point_samples(channels: int, dtype: type) -> None:
+    if channels == 1 and dtype == np.float64:
+        pytest.skip("not a format that Pillow opens")
+    ramp = np.linspace(0, 1, 256, dtype=dtype)[None].repeat(40, 0)
+    samples = ramp if channels == 1 else np.stack([ramp] * 3, -1)
+    assert np.array_equal(decode(tiff(samples))[0, :, 0], np.arange(256))
+    assert np.array_equal(decode(tiff(samples * 255))[0, :, 0], np.arange(256))
+    for factor, expected in ((40, "from 0 to 40"), (4000, "from 0 to 4000"), (np.nan, "nan"), (-1, "from -1")):
+        assert expected in error_line(tiff((samples * factor).astype(dtype)))
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [np.full((40, 60, 3), 10**6, np.int32), np.zeros((40, 60, 3), np.float16), np.zeros((40, 60), np.complex64)],
+)
+def test_samples_that_cannot_be_read_are_one_line(samples: np.ndarray) -> None:
+    error_line(tiff(samples))
+
+
+def test_colours_in_planes_are_not_mixed_up() -> None:
+    planes = np.moveaxis(quadrants(), -1, 0)
+    assert np.array_equal(decode(tiff(planes, planarconfig="separate")), quadrants())
+    assert "separate planes" in error_line(tiff(planes.astype(np.uint16) * 257, planarconfig="separate"))
+
+
+def matrix_profile(primaries: list[tuple[float, float, float]], gamma: float, *, space: bytes = b"RGB ") -> bytes:
+    """An ICC profile made of the XYZ (D50) of red, green and blue and one exponent."""
+
+    def fixed(*values: float) -> bytes:
+        return b"".join(struct.pack(">i", round(value * 65536)) for value in values)
+
+    curve = b"curv" + bytes(4) + struct.pack(">IH", 1, round(gamma * 256)) + bytes(2)
+    text = b"desc" + bytes(4) + struct.pack(">I", 5) + b"test\0" + bytes(78)
+    bodies = {
+        b"desc": text,
+        b"cprt": b"text" + bytes(4) + b"none\0\0\0\0",
+        b"wtpt": b"XYZ " + bytes(4) + fixed(0.9642, 1, 0.8249),
+    }
+    for name, colour in zip((b"rXYZ", b"gXYZ", b"bXYZ"), primaries, strict=True):
+        bodies[name] = b"XYZ " + bytes(4) + fixed(*colour)
+    bodies |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)
+    table, content, start = b"", b"", 128 + 4 + 12 * len(bodies)
+    for name, body in bodies.items():
+        table += name + struct.pack(">II", start + len(content), len(body))
+        content += body + bytes(-len(body) % 4)
+    size = start + len(content)
+    header = struct.pack(">I4sI4s4s4s", size, b"test", 0x02100000, b"mntr", space, b"XYZ ") + bytes(12) + b"acsp"
+    header += bytes(28) + fixed(0.9642, 1, 0.8249) + bytes(48)
+    return header + struct.pack(">I", len(bodies)) + table + content
+
+
+ADOBE_RGB = [(0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457)]
+SRGB = [(0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)]
+
+
+@pytest.mark.parametrize(("fmt", "bits"), [("PNG", 8), ("JPEG", 8), ("TIFF", 8), ("WEBP", 8), ("PNG", 16)])
+def test_colours_are_converted_to_srgb(fmt: str, bits: int) -> None:
+    grey_green = np.full((40, 60, 3), (100, 160, 100), np.uint8)
+    profile = matrix_profile(ADOBE_RGB, 2.2)
+    if bits == 16:
+        data = png_16(grey_green.astype(np.uint16) * 257, (b"iCCP", b"x\0\0" + zlib.compress(profile)))
+    else:
+        options = {"quality": 100} if fmt != "TIFF" else {}
+        data = encoded(Image.fromarray(grey_green), fmt, icc_profile=profile, **options)
+    found = decode(data)[20, 30].astype(int)
+    # The same colour has a larger distance from grey in the smaller colour space.
+    linear = np.array([[*column] for column in ADOBE_RGB]).T @ (np.array([100, 160, 100]) / 255) ** 2.2
+    expected = np.clip(np.linalg.solve(np.array(SRGB).T, linear), 0, 1) ** (1 / 2.2) * 255
+    assert np.abs(found - expected).max() <= 5  # the exponent of sRGB is only nearly 2.2
+    assert found[1] - found[0] > 65
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [b"no profile", b"\0" * 200, matrix_profile(ADOBE_RGB, 2.2)[:150], matrix_profile(ADOBE_RGB, 2.2, space=b"GRAY")],
+)
+def test_profiles_that_cannot_be_used_are_noted(profile: bytes) -> None:
+    picture = decode_picture(encoded(Image.fromarray(quadrants()), "PNG", icc_profile=profile), name="x", where="x")
+    assert np.array_equal(picture.pixels, quadrants())
+    assert len(picture.notes) == 1
+    assert "ignored" in picture.notes[0]
+
+
+def test_libtiff_is_not_heard(capfd: pytest.CaptureFixture[str]) -> None:
+    data = bytearray(encoded(Image.fromarray(quadrants()), "TIFF", compression="tiff_lzw"))
+    for start in (30, 200, 300):
+        broken = bytearray(data)
+        broken[start : start + 40] = bytes(range(200, 240))
+        with contextlib.suppress(UserError):
+            decode(bytes(broken))
+    with pytest.raises(UserError):
+        decode(bytes(data[: len(data) // 2]))
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("fmt", ["GIF", "WEBP", "PNG"])
@@ -208,13 +384,42 @@ def test_pillows_global_limit_is_left_alone() -> None:
     assert before == Image.MAX_IMAGE_PIXELS
 
 
-def test_exif_focal_length() -> None:
-    exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA405] = 36
-    data = encoded(Image.fromarray(np.zeros((240, 360, 3), np.uint8)), "JPEG", exif=exif.tobytes())
-    # A 3:2 frame is the 36 mm wide one itself: 36 mm is then exactly the picture's width.
-    assert decode_picture(data, name="x", where="x").exif_focal_px == pytest.approx(360, rel=1e-9)
-    assert decode_picture(encoded(Image.fromarray(quadrants()), "JPEG"), name="x", where="x").exif_focal_px is None
+@pytest.mark.parametrize("side", [4500, 8200, 14000])
+def test_few_bytes_that_announce_many_pixels_are_refused(side: int) -> None:
+    data = encoded(Image.new("L", (side, side)), "PNG")
+    assert "no photo is like that" in error_line(data)
+    assert f"{side} x {side}" in error_line(data)
+
+
+@pytest.mark.parametrize("fmt", ["AVIF", "JPEG2000", "PPM", "GIF"])
+def test_other_formats_are_read_by_content(fmt: str) -> None:
+    found = corners(decode(encoded(Image.fromarray(quadrants()), fmt)))
+    for colour, expected in zip(found, (RED, GREEN, BLUE, WHITE), strict=True):
+        assert np.abs(np.subtract(colour, expected)).max() <= 25  # lossy
+
+
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "HEIC/HEIF"),
+        (b"\0\0\0\x18ftypmif1\0\0\0\0mif1heic", "HEIC/HEIF"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL"),
+        (b"\xff\x0a\xfa\x1f", "JPEG XL"),
+        (b"\0\0\0\x14ftypqt  ", "a video"),
+        (b"\0\0\0\x14ftypisom", "a video"),
+        (b"\x1aE\xdf\xa3\x01", "a video"),
+        (b"%PDF-1.7", "PDF"),
+        (b"8BPS\0\x01", "Photoshop"),
+        (b"II*\0\x10\0\0\0CR\x02\0", "raw picture"),
+        (b"v/1\x01\x02\0", "OpenEXR"),
+        (b"<!DOCTYPE html><html>", "web page"),
+        (b"<?xml version='1.0'?><svg>", "SVG"),
+        (b'{"error": {}}', "JSON"),
+        (b"PK\x03\x04", "ZIP"),
+    ],
+)
+def test_the_true_kind_is_named(head: bytes, words: str) -> None:
+    assert words in error_line(head + bytes(range(1, 200)))
 
 
 def test_missing_file(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.errors import UserError
 from sceneexpander.ingest import IngestConfig, list_pictures, load_photos, load_scene, make_round, read_views, safe_name
-from sceneexpander.ingest.listing import natural_key
+from sceneexpander.ingest.survey import natural_key
 
 CONFIG = IngestConfig(long_side_px=56)
 ROUNDS = [make_round("A wooden bench stands behind the table.")]
@@ -128,7 +128,7 @@ def test_order(tmp_path: Path) -> None:
 
 def test_images_folder_can_be_named(tmp_path: Path) -> None:
     folder = scene_folder(tmp_path, "rounds: [{prompt: A cat.}]\nimages: photos\n")
-    assert "photos: does not exist" in refusal(folder)
+    assert "names photos, which does not exist" in refusal(folder)
     (folder / "captured").rename(folder / "photos")
     assert len(load_scene(folder, CONFIG).views) == 2
     (folder / "scene.yaml").write_text("rounds: [{prompt: A cat.}]\nimages: ../elsewhere\n")
@@ -155,14 +155,17 @@ def test_much_cropped_views_are_noted(tmp_path: Path) -> None:
     assert loaded.notes[0].startswith("b.png: only 50%") or loaded.notes[0].startswith("b.png: only 4")
 
 
-def test_exif_focal_is_in_stored_pixels(tmp_path: Path) -> None:
+def test_lens_facts_reach_the_records(tmp_path: Path) -> None:
     exif = Image.Exif()
+    exif[0x0110] = "Phone 7"
     exif.get_ifd(0x8769)[0xA405] = 36
     paths = [photo(tmp_path / "a.jpg", 1, exif=exif.tobytes()), photo(tmp_path / "b.jpg", 2)]
-    loaded = read_views(paths, CONFIG)
-    scale = loaded.views.records[0].stored_from_original[0][0]
-    assert loaded.exif_focal_px[0] == pytest.approx(120 * scale)
-    assert loaded.exif_focal_px[1] is None
+    first, second = read_views(paths, CONFIG).views.records
+    assert first.lens is not None
+    assert first.lens.camera == "Phone 7"
+    assert first.lens.focal_px == pytest.approx(120)  # of the original's pixels
+    assert second.lens is not None
+    assert second.lens.focal_px is None
 
 
 def test_links(tmp_path: Path) -> None:

@@ -50,6 +50,20 @@ def assert_same(a: Reconstruction, b: Reconstruction) -> None:
     assert torch.equal(a.depth, b.depth)
 
 
+def test_pixels_that_do_not_show_the_place_teach_nothing() -> None:
+    misleading, valid = VIEWS.images.clone(), torch.ones(TRUTH.depth.shape, dtype=torch.bool)
+    height = misleading.shape[2] // 2
+    misleading[:, :, :height], valid[:, : height + 6] = 0.0, False
+    config = OptimiseConfig(steps=60, sh_degree=0, density=DensityConfig(start=0.0, every=20, max_gaussians=4500))
+    results = []
+    for mask in (valid, None):
+        found = optimise(spoiled(), misleading, config, method="gaussian_splatting", seed=0, valid=mask).reconstruction
+        shown = own_pictures(found).images
+        # What a bar hides keeps its opacity unless the bar is believed to be there.
+        results.append(float(shown[:, :, : height - 8].mean()))
+    assert results[0] > results[1] + 0.05
+
+
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_it_gets_much_better(strategy: str) -> None:
     density = DensityConfig(strategy=strategy, start=0.0, every=20, max_gaussians=4500)  # type: ignore[arg-type]

@@ -1,0 +1,26 @@
+"""The fit of a round's Gaussians believes only what shows the place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sceneexpander.expansion.rounds import refined
+from sceneexpander.optimisation.refine import RefineConfig
+from tests.unit.evaluation.made import own_pictures
+from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
+
+
+@pytest.mark.parametrize("doubt", [True, False])
+def test_bars_teach_nothing(doubt: bool) -> None:
+    misleading, valid = VIEWS.images.clone(), torch.ones(TRUTH.depth.shape, dtype=torch.bool)
+    height = misleading.shape[2] // 2
+    misleading[:, :, :height], valid[:, : height + 6] = 0.0, False
+    shown = []
+    for mask in (valid, None):
+        views = replace(VIEWS, images=misleading, valid=mask)
+        result, _ = refined(spoiled(), views, RefineConfig(steps=30), doubt_generated=doubt, seed=0)
+        shown.append(float(own_pictures(result).images[:2, :, : height - 8].mean()))
+    assert shown[0] > shown[1] + 0.03
