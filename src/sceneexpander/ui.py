@@ -12,7 +12,7 @@ from sceneexpander.project import LIVE_FOLDER, find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.describe import experiment_links
 from sceneexpander.tracking.follow import Follower
-from sceneexpander.tracking.store import database_path, describe_experiments, quiet_environment, tracking_uri
+from sceneexpander.tracking.store import database_path, last_experiment, quiet_environment, tracking_uri
 
 
 @entry_point
@@ -28,7 +28,7 @@ def main() -> None:
         raise UserError("does not exist yet", where=database_path(root), fix="run `make repro` first")
     quiet_environment()
     # The landing page is about something else.
-    for name, link in experiment_links(f"http://127.0.0.1:{port}", describe_experiments(root)[0]).items():
+    for name, link in experiment_links(f"http://127.0.0.1:{port}", last_experiment(root)).items():
         print(f"{name + ':':9} {link}", flush=True)
     command = [sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port)]
     command += ["--backend-store-uri", tracking_uri(TrackingConfig(), root)]

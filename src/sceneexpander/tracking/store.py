@@ -131,19 +131,29 @@ def open_store(config: TrackingConfig, root: Path) -> tuple[Any, str]:
         raise UserError(f"cannot be used ({first})", where=f"tracking.uri {config.uri}") from None
 
 
-def describe_experiments(root: Path) -> list[str]:
-    """Bring descriptions and saved views of all experiments of the local store up to date. Returns their ids, the last used first.
+def last_experiment(root: Path) -> str:
+    """Id of the local store's experiment with the latest run, straight from the database; the first one that is made, without runs."""
+    query = "SELECT experiment_id FROM runs WHERE lifecycle_stage = 'active' ORDER BY start_time DESC LIMIT 1"
+    try:
+        with contextlib.closing(sqlite3.connect(database_path(root))) as database:
+            found = database.execute(query).fetchone()
+    except sqlite3.DatabaseError:
+        found = None
+    return "1" if found is None else str(found[0])  # 0 is MLflow's own default
+
+
+def describe_experiments(config: TrackingConfig, root: Path) -> None:
+    """Bring descriptions and saved views of the experiments that are there up to date: of all in the local store, of the named one else.
 
     Raises:
-        UserError: the store cannot be read.
+        UserError: the server cannot be reached or refuses.
     """
-    client, _ = open_store(TrackingConfig(), root)
-    found = [item.experiment_id for item in client.search_experiments(order_by=["last_update_time DESC"])]
-    ours = [experiment for experiment in found if experiment != "0"]  # that one is MLflow's own default
-    ours.sort(key=lambda experiment: not client.search_runs([experiment], max_results=1))
-    for experiment in ours:
+    if config.uri == "off" or (config.uri == "local" and not database_path(root).is_file()):
+        return
+    client, named = open_store(config, root)
+    local = [item.experiment_id for item in client.search_experiments()] if config.uri == "local" else []
+    for experiment in {named, *local} - {"0"}:
         describe_experiment(client, experiment)
-    return ours
 
 
 def _complete(client: Any, experiment: str, wanted: Collection[str]) -> dict[str, str]:

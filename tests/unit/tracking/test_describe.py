@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from sceneexpander.artifacts.quantities import TABLE, Group
-from sceneexpander.tracking import record_runs
+from sceneexpander.tracking import TrackingConfig, record_runs
 from sceneexpander.tracking.describe import NOTE_TAG, VIEWS, experiment_links, experiment_note, run_note
-from sceneexpander.tracking.store import NAMES, database_path, describe_experiments
+from sceneexpander.tracking.store import NAMES, database_path, describe_experiments, last_experiment
 from tests.unit.tracking.test_store import CONFIG, client, record, runs
 
 
@@ -59,16 +60,33 @@ def test_a_description_is_brought_up_to_date_unless_a_person_wrote_it(
     assert tags(root)[NOTE_TAG] == ("a later version" if written_by == "us" else "our own words")
 
 
-def test_a_store_from_before_gets_its_views_and_the_used_experiment_comes_first(root: Path) -> None:
+def test_a_store_from_before_gets_its_views(root: Path) -> None:
     record_runs([record(root, "a")], CONFIG, root)
     with sqlite3.connect(database_path(root)) as database:
         database.execute("DELETE FROM experiment_tags")
-    used = client(root).get_experiment_by_name(CONFIG.experiment).experiment_id
-    found = describe_experiments(root)
-    assert used in found
-    assert "0" not in found
-    assert client(root).search_runs([found[0]], max_results=1)
+    describe_experiments(TrackingConfig(), root)
     assert f"mlflow.sharedViewState.{VIEWS[0].key}" in tags(root)
+    assert NOTE_TAG not in client(root).get_experiment("0").tags, "MLflow's own is left alone"
+
+
+@pytest.mark.parametrize("uri", ["off", "local"])
+def test_nothing_to_describe_makes_nothing(tmp_path: Path, uri: str) -> None:
+    describe_experiments(TrackingConfig(uri=uri), tmp_path)
+    assert not (tmp_path / "mlflow").exists()
+
+
+def test_links_lead_to_the_experiment_of_the_latest_run(root: Path) -> None:
+    record_runs([replace(record(root, "a"), started_ms=2_000_000_000_000)], CONFIG, root)
+    assert last_experiment(root) == client(root).get_experiment_by_name(CONFIG.experiment).experiment_id
+    record_runs([record(root, "b")], replace(CONFIG, experiment="another"), root)
+    assert last_experiment(root) == client(root).get_experiment_by_name(CONFIG.experiment).experiment_id
+
+
+def test_links_of_a_store_that_cannot_be_read_lead_somewhere(tmp_path: Path) -> None:
+    database_path(tmp_path).parent.mkdir()
+    for content in (b"", b"no database"):
+        database_path(tmp_path).write_bytes(content)
+        assert last_experiment(tmp_path) == "1"
 
 
 def test_runs_with_the_names_of_an_earlier_version_are_recorded_again(root: Path) -> None:
