@@ -239,6 +239,9 @@ def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     if config["refine"]["steps"]:
         steps = config["refine"]["steps"]
         rows.append(("Gaussians", f"in all rows of this reconstructor fitted to their pictures for {steps} steps"))
+    rows.append(
+        ("All runs", "make ui opens MLflow with the numbers of this and other runs; its menu Views has the columns")
+    )
     return rows
 
 
