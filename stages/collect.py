@@ -31,6 +31,7 @@ def _round(scene: str, number: int, methods: list[str]) -> RoundSource:
         ],
         log=layout.state(scene, number) / "log.json",
         statistics=layout.round_folder(scene, number) / "stats",
+        cameras=layout.cameras(layout.joint_priors(scene, number)),
     )
 
 
@@ -45,6 +46,7 @@ def main(cell: Cell) -> None:
         rounds=[_round(cell.scene, item["k"], selected["methods"]) for item in selected["rounds"]],
         config=read_yaml(layout.config(cell.scene)),
         overrides=read_overrides(Path("params.yaml")),
+        cameras=layout.cameras(layout.state(cell.scene, 0)),
     )
     with directory_being_written(layout.PAGES / cell.scene) as folder:
         collect_scene(source, folder)

@@ -10,6 +10,7 @@ from sceneexpander.errors import UserError, entry_point
 from sceneexpander.project import LIVE_FOLDER, find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.follow import Follower
+from sceneexpander.tracking.store import describe_experiments
 
 
 @entry_point
@@ -24,8 +25,10 @@ def main() -> None:
         raise UserError(f"must be above 0, is {options.interval}", where="--interval")
     logging.basicConfig(level=logging.INFO, format="%(levelname)s follow: %(message)s")
     root = find_project()
-    follower = Follower(root / LIVE_FOLDER, root, TrackingConfig(uri=options.uri))
+    config = TrackingConfig(uri=options.uri)
+    follower = Follower(root / LIVE_FOLDER, root, config)
     try:
+        describe_experiments(config, root)  # a store of an earlier version has no saved views yet
         while True:
             follower.poll()
             if options.once:

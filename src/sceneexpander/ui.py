@@ -10,13 +10,14 @@ import sys
 from sceneexpander.errors import UserError, entry_point
 from sceneexpander.project import LIVE_FOLDER, find_project
 from sceneexpander.tracking.config import TrackingConfig
+from sceneexpander.tracking.describe import experiment_links
 from sceneexpander.tracking.follow import Follower
-from sceneexpander.tracking.store import database_path, quiet_environment, tracking_uri
+from sceneexpander.tracking.store import database_path, last_experiment, quiet_environment, tracking_uri
 
 
 @entry_point
 def main() -> None:
-    """Start the server and print a link that opens the charts."""
+    """Start the server and print links that open the numbers, the charts and the pictures."""
     parser = argparse.ArgumentParser(prog="python -m sceneexpander.ui", description=__doc__)
     parser.add_argument("--port", type=int, default=5000)
     port = parser.parse_args().port
@@ -26,9 +27,9 @@ def main() -> None:
     if not database_path(root).is_file():
         raise UserError("does not exist yet", where=database_path(root), fix="run `make repro` first")
     quiet_environment()
-    # The landing page is about something else; experiment 1 is the first one made after MLflow's own default.
-    base = f"http://127.0.0.1:{port}/#/experiments/1/runs?workflowType=machine_learning&compareRunsMode="
-    print(f"charts:   {base}CHART\npictures: {base}ARTIFACT", flush=True)
+    # The landing page is about something else.
+    for name, link in experiment_links(f"http://127.0.0.1:{port}", last_experiment(root)).items():
+        print(f"{name + ':':9} {link}", flush=True)
     command = [sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port)]
     command += ["--backend-store-uri", tracking_uri(TrackingConfig(), root)]
     follower = subprocess.Popen([sys.executable, "-m", "sceneexpander.follow"], cwd=root)

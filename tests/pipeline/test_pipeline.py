@@ -113,7 +113,7 @@ def test_everything_that_was_promised_is_there(finished: Project) -> None:
         assert (outputs / "report" / place).is_file(), place
     assert "WorldMirror" not in page
     assert re.findall(r"looks/(inserted_\d+|depth_\d+)\.jpg", page) == [
-        f"{kind}_{step:04d}" for kind in ("inserted", "depth") for step in (0, 4)
+        f"{kind}_{step:04d}" for step in (0, 4) for kind in ("inserted", "depth")
     ]
     assert "captured views see" in page or "fits badly" in page, "the verdict on the inserted view"
     assert len(re.findall(r"Gaussians of [^<]* 4 steps", page)) == 3

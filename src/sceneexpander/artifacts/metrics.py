@@ -65,6 +65,9 @@ class MetricsRow:
     deviations (n - 1) by name (see `value`); ``views`` are those of the first run.
 
     ``psnr_db``, ``ssim`` and ``st_lpips`` are over the captured views (preservation), ``inserted_`` over the view inserted in this round.
+    A view without a pose stands at a placeholder and shows little but its own Gaussians: it is in ``views`` and in no mean, and without
+    a pose of the inserted view there are no ``inserted_`` numbers. ``captured_views_posed`` is the count behind the means; 0 means that
+    no captured view has a pose, and then the means are over all of them.
     ``navigation_coverage`` is the mean share of covered pixels over the frames of the navigation.
     """
 
@@ -92,6 +95,7 @@ class MetricsRow:
     navigation_coverage: float | None = None
     navigation_frames: int = 0
     truth: TruthMetrics | None = None
+    captured_views_posed: int | None = None
     repeats: int = 1
     spread: dict[str, float] = field(default_factory=dict)
     views: tuple[ViewMetrics, ...] = ()

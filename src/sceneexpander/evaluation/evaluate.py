@@ -46,7 +46,7 @@ def evaluate(
         views: pictures of at least the reconstruction's views.
         config: settings.
         scene: name for the row.
-        round_number: the round; the ``inserted_`` numbers are those of the view inserted in it, if the reconstruction has it.
+        round_number: the round; the ``inserted_`` numbers are those of the view inserted in it, if the reconstruction has it with a pose.
         seed: for the row.
         navigation: frames for the coverage, if wanted.
         truth: known truth, if any.
@@ -54,7 +54,9 @@ def evaluate(
     captured = preservation(reconstruction, views, config)
     inserted = insertion_fidelity(reconstruction, views, config)
     in_this_round = {record.view_id for record in views.records if record.round == round_number}
-    new = next((row for row in inserted if row.view_id in in_this_round), None)
+    new = next((row for row in inserted if row.view_id in in_this_round and row.posed), None)
+    posed = tuple(row for row in captured if row.posed)
+    counted = posed or captured
     frames = None
     if navigation is not None:
         frames = navigation_coverage(
@@ -76,12 +78,13 @@ def evaluate(
         generated_views=len(inserted),
         gaussians=len(reconstruction.gaussians),
         generated_gaussians=int(reconstruction.gaussians.generated.sum()),
-        psnr_db=_mean(row.psnr_db for row in captured),
-        ssim=_mean(row.ssim for row in captured),
-        coverage=_mean(row.coverage for row in captured),
-        depth_disagreement=_mean_of_all(captured, "depth_disagreement"),
-        others_psnr_db=_mean_of_all(captured, "others_psnr_db"),
-        st_lpips=_mean_of_all(captured, "st_lpips"),
+        captured_views_posed=len(posed),
+        psnr_db=_mean(row.psnr_db for row in counted),
+        ssim=_mean(row.ssim for row in counted),
+        coverage=_mean(row.coverage for row in counted),
+        depth_disagreement=_mean_of_all(counted, "depth_disagreement"),
+        others_psnr_db=_mean_of_all(counted, "others_psnr_db"),
+        st_lpips=_mean_of_all(counted, "st_lpips"),
         inserted_psnr_db=None if new is None else new.psnr_db,
         inserted_ssim=None if new is None else new.ssim,
         inserted_st_lpips=None if new is None else new.st_lpips,

@@ -9,22 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.metrics import MetricsRow, Row, UnavailableRow
+from sceneexpander.artifacts.quantities import METHOD_TITLES
 
 MISSING = "missing"
 NOT_APPLICABLE = "–"
 CEILING = "captured"
-
-METHOD_TITLES = {
-    "captured": "captured only (ceiling of preservation)",
-    "gaussian_splatting": "3DGS per scene, from the backbone's cameras and Gaussians",
-    "omnivggt": "OmniVGGT (pixel-aligned Gaussians)",
-    "omnivggt_optimised": "OmniVGGT (3DGS from its points and cameras)",
-    "ttt3r": "TTT3R (pixel-aligned Gaussians)",
-    "ttt3r_optimised": "TTT3R (3DGS from its points and cameras)",
-    "backbone": "backbone with the inserted view, unadapted",
-    "sceneexpander": "SceneExpander",
-    "sceneexpander_optimised": "SceneExpander + post-optimisation (3DGS)",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -144,7 +144,8 @@ def against_truth(
                     new_region=_in_stored_pixels(found.new_region, record, height, width),
                 )
             )
-    captured = [item for item in known if not item.record.generated]
+    # A captured view without a pose stands at a placeholder: it is left out here as in every other mean.
+    captured = [item for item in known if not item.record.generated and bool(reconstruction.posed[item.index])]
     inserted = [item for item in known if item.record.generated and item.record.round == round_number]
     rotation, direction = _pair_errors(reconstruction, _pairs(captured, captured))
     inserted_rotation, inserted_direction = _pair_errors(reconstruction, _pairs(captured, inserted))

@@ -19,17 +19,18 @@ from sceneexpander.artifacts.store import ArtifactError, read_json, write_bytes_
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.report.camera_map import camera_map
+from sceneexpander.report.cameras import FACTS, gathered_cameras
 from sceneexpander.report.course import verdict
 from sceneexpander.report.words import method_words
 from sceneexpander.viewer.packed import PackedSplats
 from sceneexpander.viewer.page import ShownMethod, viewer_page
 
-FACTS = "page.json"
 MAIN_METHOD = "sceneexpander"
 LOOK_PICTURES = ("captured", "inserted", "depth")  # of every look, named with its step
 _PICTURE_SIDE_PX = 720
-_LOSSES = (
+_SERIES = (
     "loss",
+    "inserted",
     "anchor_camera",
     "anchor_depth",
     "anchor_normal",
@@ -63,7 +64,8 @@ class RoundSource:
     """Artefacts of one round.
 
     ``log`` is the adaptation's, with its looks (``looks.json``, ``looks/``) and the verdict on the inserted view
-    (``acceptance.json``) beside it, where there are any; ``statistics`` holds one file per stage run.
+    (``acceptance.json``) beside it, where there are any; ``statistics`` holds one file per stage run. ``cameras`` is the `CameraReport`
+    of all views, the inserted one included; its folder does not exist where the model needs no cameras.
     """
 
     number: int
@@ -71,11 +73,12 @@ class RoundSource:
     methods: Sequence[MethodSource]
     log: Path
     statistics: Path
+    cameras: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneSource:
-    """Artefacts of one scene. ``report`` is what the first reconstruction said about itself."""
+    """Artefacts of one scene. ``report`` is what the first reconstruction said about itself, ``cameras`` its `CameraReport` if any."""
 
     scene: Path
     report: Path
@@ -83,6 +86,7 @@ class SceneSource:
     rounds: Sequence[RoundSource]
     config: Mapping[str, Any]
     overrides: Sequence[str]
+    cameras: Path | None = None
 
 
 def collect_scene(source: SceneSource, folder: Path) -> None:
@@ -99,8 +103,9 @@ def collect_scene(source: SceneSource, folder: Path) -> None:
         "overrides": list(source.overrides),
         "model": read_json(source.report),
         "captured": _captured(scene.views, folder),
+        "cameras": gathered_cameras(source.cameras),
         "statistics": _statistics(source.statistics),
-        "rounds": [_round(item, scene, folder) for item in source.rounds],
+        "rounds": [_round(item, source, scene, folder) for item in source.rounds],
     }
     _write_viewers(source, scene, folder)
     write_json_atomic(folder / FACTS, facts)
@@ -150,7 +155,7 @@ def _captured(views: ViewSet, folder: Path) -> list[dict[str, Any]]:
     return entries
 
 
-def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
+def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder: Path) -> dict[str, Any]:
     inserted = InsertedView.load(source.inserted)
     chosen = inserted.provenance[inserted.chosen]
     base = f"round_{source.number}"
@@ -160,6 +165,7 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
         shutil.copyfile(sheet, folder / base / "sheet.png")
     spec = scene.round_spec(source.number)
     log = read_json(source.log)
+    cameras = gathered_cameras(source.cameras)
     looks = _looks(source.log.parent, folder, base)
     acceptance = _read_if_any(source.log.parent / "acceptance.json")
     missing = {item.name: lacking for item in source.methods if (lacking := unavailable_in(item.reconstruction))}
@@ -189,16 +195,30 @@ def _round(source: RoundSource, scene: Scene, folder: Path) -> dict[str, Any]:
             for item in source.methods
             if item.name in missing
         ],
-        "series": {name: [record[name] for record in log] for name in _LOSSES if log and name in log[0]},
+        "series": {name: [record[name] for record in log] for name in _SERIES if log and name in log[0]},
         "looks": looks,
+        "cameras": cameras,
+        "problems": _problems(source, scene_source, folder, base),
         "acceptance": acceptance,
         "statistics": _statistics(source.statistics),
         "warnings": [
-            *_warnings(methods, chosen.parameters),
+            *_warnings(methods, chosen.parameters, cameras),
             *([judged.text] if (judged := verdict(acceptance)) is not None and judged.refused else []),
             *(looks["warnings"] if looks else []),
         ],
     }
+
+
+def _problems(source: RoundSource, scene: SceneSource, folder: Path, base: str) -> str | None:
+    """Where everything that is not as it should be with the cameras lies, as a text for the tracked runs; None without any."""
+    sets = (("the photos alone", scene.cameras), ("with the inserted view", source.cameras))
+    found = [(title, cameras) for title, place in sets if (cameras := gathered_cameras(place)) is not None]
+    if not any(cameras["problems"] for _, cameras in found):
+        return None
+    place = f"{base}/cameras.txt"
+    lines = [line for title, cameras in found for line in (f"{title}: {cameras['summary']}", *cameras["problems"], "")]
+    write_bytes_atomic(folder / place, "\n".join(lines).encode())
+    return place
 
 
 def _looks(source: Path, folder: Path, base: str) -> dict[str, Any] | None:
@@ -268,10 +288,14 @@ def _method(source: MethodSource, folder: Path, base: str) -> dict[str, Any]:
     }
 
 
-def _warnings(methods: Sequence[Mapping[str, Any]], parameters: Mapping[str, str]) -> list[str]:
+def _warnings(
+    methods: Sequence[Mapping[str, Any]], parameters: Mapping[str, str], cameras: Mapping[str, Any] | None
+) -> list[str]:
     found = []
+    # What the cameras' own report says is not repeated for every method.
+    said = {view.view_id for view in cameras["views"] if not view.posed} if cameras is not None else set()
     for method in methods:
-        lost = [view["id"] for view in method["views"] if not view["posed"]]
+        lost = [view["id"] for view in method["views"] if not view["posed"] and view["id"] not in said]
         if lost:
             found.append(
                 f"{method['name']}: no camera could be estimated for {', '.join(lost)}; a placeholder was used."

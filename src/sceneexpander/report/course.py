@@ -2,41 +2,41 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sceneexpander.report.words import LOOK_COLUMNS, Column, method_words
+from sceneexpander.artifacts.quantities import DRIFT_ALL, LOOKS, Quantity, drift_of_all
+from sceneexpander.report.words import method_words
 
 FITTED = "Its Gaussians were fitted to its pictures: PSNR, SSIM and ST-LPIPS are those of pictures it was fitted to."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LookCell:
-    """One number of one look, and what was gained since the first one (empty: nothing to compare)."""
+class LookNumber:
+    """One number of one look with its unit, and what was gained since the first look (empty: nothing to compare)."""
 
+    label: str
     text: str
     gain: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LookRow:
-    """One number of all looks."""
+class LookCard:
+    """One look: when, the inserted view's pictures (None where one was not kept), and its numbers."""
 
-    label: str
-    meaning: str
-    cells: tuple[LookCell, ...]
+    heading: str
+    render: str | None
+    depth: str | None
+    numbers: tuple[LookNumber, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LooksTable:
-    """Looks side by side: headings, the inserted view's pictures (None where one was not kept), numbers, and what they warn of."""
+class LooksShown:
+    """Looks side by side, what their numbers mean, and what they warn of."""
 
-    headings: tuple[str, ...]
-    renders: tuple[str | None, ...]
-    depths: tuple[str | None, ...]
-    rows: tuple[LookRow, ...]
+    cards: tuple[LookCard, ...]
+    meanings: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
 
 
@@ -48,33 +48,37 @@ class Verdict:
     refused: bool
 
 
-def looks_table(looks: Mapping[str, Any] | None) -> LooksTable | None:
-    """The gathered looks of a round as a table with a column per look; None if there was none."""
+def looks_shown(looks: Mapping[str, Any] | None) -> LooksShown | None:
+    """The gathered looks of a round, one card each; None if there was none."""
     if looks is None:
         return None
-    entries = looks["entries"]
-    return LooksTable(
-        headings=tuple(f"after step {look['step']}" if look["step"] else "before the first step" for look in entries),
-        renders=tuple(look["pictures"].get("inserted") for look in entries),
-        depths=tuple(look["pictures"].get("depth") for look in entries),
-        rows=tuple(_row(column, [_value(look, column.name) for look in entries]) for column in LOOK_COLUMNS),
+    first = looks["entries"][0]
+    return LooksShown(
+        cards=tuple(
+            LookCard(
+                heading=f"after step {look['step']}" if look["step"] else "before the first step",
+                render=look["pictures"].get("inserted"),
+                depth=look["pictures"].get("depth"),
+                numbers=tuple(_number(item, look, None if look is first else first) for item in LOOKS),
+            )
+            for look in looks["entries"]
+        ),
+        meanings=tuple((item.title, item.meaning) for item in LOOKS),
         warnings=tuple(looks["warnings"]),
     )
 
 
-def _value(look: Mapping[str, Any], name: str) -> float:
-    # Modules share no weight, so the norms by module add up, squared, to that of everything.
-    return math.hypot(*look["drift"].values()) if name == "drift" else float(look[name])
+def _value(look: Mapping[str, Any], item: Quantity) -> float:
+    return drift_of_all(look) if item is DRIFT_ALL else float(look[item.name])
 
 
-def _row(column: Column, values: Sequence[float]) -> LookRow:
-    cells = []
-    for index, value in enumerate(values):
-        # The other numbers are differences already.
-        gained = index > 0 and column.better == "higher"
-        gain = round(value - values[0], column.digits) + 0.0  # no negative zero
-        cells.append(LookCell(text=column.text(value), gain=f"{gain:+.{column.digits}f}" if gained else ""))
-    return LookRow(label=column.label, meaning=column.meaning, cells=tuple(cells))
+def _number(item: Quantity, look: Mapping[str, Any], first: Mapping[str, Any] | None) -> LookNumber:
+    value, gain = _value(look, item), ""
+    # The other numbers are differences already.
+    if first is not None and item.better == "higher":
+        gained = round(value - _value(first, item), item.digits) + 0.0  # no negative zero
+        gain = f"{gained:+.{item.digits}f}"
+    return LookNumber(label=item.title, text=item.text_with_unit(value), gain=gain)
 
 
 def verdict(acceptance: Mapping[str, Any] | None) -> Verdict | None:

@@ -8,12 +8,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
+from sceneexpander.artifacts.quantities import Quantity
 from sceneexpander.artifacts.store import read_json, write_bytes_atomic
-from sceneexpander.report.collect import FACTS, MAIN_METHOD
-from sceneexpander.report.course import FITTED, fits, looks_table, verdict, was_fitted
-from sceneexpander.report.curve import loss_curve
-from sceneexpander.report.words import COLUMNS, LAYERS, Column, method_words
+from sceneexpander.report.cameras import FACTS, cameras_shown
+from sceneexpander.report.collect import MAIN_METHOD
+from sceneexpander.report.course import FITTED, fits, looks_shown, verdict, was_fitted
+from sceneexpander.report.curve import curve_chart, objective_curves, smoothing_window
+from sceneexpander.report.words import LAYERS, TABLES, method_words
 
 _ARROWS = {"higher": "\u2191", "lower": "\u2193", "": ""}
 
@@ -50,6 +52,7 @@ def _scene(facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         "anchor": folder.name,
         "media": f"media/{folder.name}",
         "captured": facts["captured"],
+        "cameras": cameras_shown(facts["cameras"], _pictures(facts)),
         "rounds": [_round(item, facts, folder) for item in facts["rounds"]],
         "facts": _facts(facts),
         "timings": _timings(facts),
@@ -65,8 +68,7 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
         goal = method["inserted_frame"] / max(method["frames"], 1)
         methods.append({**method, "label": words.label, "short": words.short, "poster": poster, "goal": goal})
     rows = {method["name"]: MetricsRow.load(folder / method["metrics"]) for method in facts["methods"]}
-    columns = [c for c in COLUMNS if any(row.value(c.name) is not None for row in rows.values())]
-    series = facts["series"]
+    curves, steps = objective_curves(facts["series"]), len(facts["series"].get("loss", ()))
     return {
         **{
             key: facts[key]
@@ -76,59 +78,138 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
         "warnings": facts["warnings"],
         "methods": methods,
         "main": MAIN_METHOD,
-        "columns": [{"label": c.label, "meaning": c.meaning, "better": _ARROWS[c.better]} for c in columns],
-        "table": [_table_row(method, rows, columns) for method in methods],
+        "cameras": cameras_shown(facts["cameras"], _pictures(scene)),
+        "tables": [found for title, shown in TABLES if (found := _table(title, shown, methods, rows)) is not None],
+        "left_out": _left_out(rows, _names(scene)),
+        "meanings": [(method["label"], _method_meaning(method)) for method in methods],
         "unavailable": [
             {**item, "label": method_words(item["name"], item["model"]).label} for item in facts["unavailable"]
         ],
-        "curve": loss_curve(series["loss"]) if series.get("loss") else "",
-        "steps": len(series.get("loss", ())),
-        "looks": looks_table(facts["looks"]),
+        "curve": curve_chart(curves, steps),
+        "curves": curves,
+        "smoothed": max((smoothing_window(curve) for curve in curves), default=1) > 1,
+        "steps": steps,
+        "looks": looks_shown(facts["looks"]),
         "verdict": verdict(facts["acceptance"]),
         "fits": fits(facts["methods"]),
-        "view_rows": _view_rows(facts, scene, methods),
+        "view_groups": _view_groups(facts, scene, methods, rows),
     }
 
 
-def _table_row(method: Mapping[str, Any], rows: Mapping[str, MetricsRow], columns: Sequence[Column]) -> dict[str, Any]:
-    words = method_words(method["name"], method["model"])
-    cells = []
-    for column in columns:
-        value = rows[method["name"]].value(column.name)
-        # The ceiling of preservation is not a competitor: bold compares the methods that show the new view, as far as the printed
-        # digits go.
-        rivals = {name: round(v, column.digits + 2 * column.percent) for name, v in _known(rows, column).items()}
-        best = (max if column.better == "higher" else min)(rivals.values(), default=None)
-        wins = len(set(rivals.values())) > 1 and rivals.get(method["name"]) == best
-        spread = rows[method["name"]].spread.get(column.name)
-        text = column.text(value) + ("" if spread is None else f" \u00b1 {column.text(spread)}")
-        cells.append({"text": text, "best": wins})
-    fitted = f" {FITTED}" if was_fitted(method) else ""
-    return {"name": method["name"], "label": words.label, "meaning": words.meaning + fitted, "cells": cells}
+def _table(
+    title: str, quantities: Sequence[Quantity], methods: Sequence[Mapping[str, Any]], rows: Mapping[str, MetricsRow]
+) -> dict[str, Any] | None:
+    """One table of numbers, a line per method; None if nothing of it is known."""
+    shown = [item for item in quantities if any(row.value(item.name) is not None for row in rows.values())]
+    if not shown:
+        return None
+    return {
+        "title": title,
+        "columns": [
+            {"title": c.title, "heading": c.heading, "meaning": c.meaning, "better": _ARROWS[c.better]} for c in shown
+        ],
+        "rows": [
+            {"name": m["name"], "label": m["label"], "cells": [_cell(m["name"], rows, item) for item in shown]}
+            for m in methods
+        ],
+    }
 
 
-def _known(rows: Mapping[str, MetricsRow], column: Column) -> dict[str, float]:
-    values = {name: row.value(column.name) for name, row in rows.items() if name != "captured"}
-    return {name: value for name, value in values.items() if value is not None}
+def _cell(method: str, rows: Mapping[str, MetricsRow], item: Quantity) -> dict[str, Any]:
+    value, spread = rows[method].value(item.name), rows[method].spread.get(item.name)
+    # The ceiling of preservation is not a competitor: bold compares the methods that show the new view, as far as the printed
+    # digits go.
+    known = {name: row.value(item.name) for name, row in rows.items() if name != "captured"}
+    rivals = {name: round(v, item.digits + 2 * (item.unit == "%")) for name, v in known.items() if v is not None}
+    best = (max if item.better == "higher" else min)(rivals.values(), default=None)
+    return {
+        "text": item.text(value) + ("" if spread is None else f" \u00b1 {item.text(spread)}"),
+        "unit": item.unit if item.unit != "%" and value is not None else "",
+        "best": len(set(rivals.values())) > 1 and rivals.get(method) == best,
+    }
 
 
-def _view_rows(
-    facts: Mapping[str, Any], scene: Mapping[str, Any], methods: Sequence[Mapping[str, Any]]
+def _method_meaning(method: Mapping[str, Any]) -> str:
+    return method_words(method["name"], method["model"]).meaning + (f" {FITTED}" if was_fitted(method) else "")
+
+
+def _left_out(rows: Mapping[str, MetricsRow], names: Mapping[str, str]) -> list[str]:
+    """A sentence for every set of views that a mean is not over because they have no camera, with the methods it is about."""
+    about: dict[tuple[int, int, tuple[str, ...]], list[str]] = {}
+    for method, row in rows.items():
+        lost = tuple(view.view_id for view in row.views if not view.generated and not view.posed)
+        if lost:
+            about.setdefault((row.captured_views_posed or 0, row.captured_views, lost), []).append(method)
+    sentences = []
+    for (posed, captured, lost), methods in about.items():
+        who = "" if len(methods) == len(rows) else f" ({', '.join(methods)})"
+        apart = ", ".join(names.get(view, view) for view in lost)
+        sentences.append(
+            f"Means are over the {posed} of {captured} photos that have a camera{who}; left out: {apart}."
+            if posed
+            else f"No photo has a camera{who}: the means are over placeholders and say little."
+        )
+    if any(view.generated and not view.posed for row in rows.values() for view in row.views):
+        sentences.append("An inserted view without a camera has no numbers here.")
+    return sentences
+
+
+def _pictures(scene: Mapping[str, Any]) -> dict[str, str]:
+    """Pictures of all views by id."""
+    return {view["id"]: view["picture"] for view in scene["captured"]} | {
+        item["inserted_id"]: item["inserted"] for item in scene["rounds"]
+    }
+
+
+def _names(scene: Mapping[str, Any]) -> dict[str, str]:
+    """What people call the views: file names of photos, rounds of inserted pictures."""
+    return {view["id"]: view["name"] for view in scene["captured"]} | {
+        item["inserted_id"]: f"inserted view of round {item['number']}" for item in scene["rounds"]
+    }
+
+
+def _view_groups(
+    facts: Mapping[str, Any],
+    scene: Mapping[str, Any],
+    methods: Sequence[Mapping[str, Any]],
+    rows: Mapping[str, MetricsRow],
 ) -> list[dict[str, Any]]:
-    pictures = {view["id"]: view["picture"] for view in scene["captured"]}
-    pictures |= {item["inserted_id"]: item["inserted"] for item in scene["rounds"]}
+    """Every view at its own camera, with its PSNR; views that some method has no camera for are kept apart."""
+    pictures, names = _pictures(scene), _names(scene)
+    measured = {name: {view.view_id: view for view in row.views} for name, row in rows.items()}
     known: dict[str, bool] = {}
     for method in methods:
         known |= {view["id"]: view["generated"] for view in method["views"]}
-    return [
+    lost = {view["id"] for method in methods for view in method["views"] if not view["posed"]}
+    entries = [
         {
             "id": view,
+            "name": names.get(view, view),
             "generated": generated,
             "picture": pictures.get(view),
-            "renders": [method["view_pictures"].get(view) for method in methods],
+            "renders": [
+                {
+                    "label": method["label"],
+                    "picture": method["view_pictures"].get(view),
+                    "number": _view_number(measured[method["name"]].get(view)),
+                }
+                for method in methods
+                if view in {item["id"] for item in method["views"]}
+            ],
         }
         for view, generated in known.items()
     ]
+    groups = [
+        ("", [entry for entry in entries if entry["id"] not in lost]),
+        ("Without a camera: at a placeholder, in no mean", [entry for entry in entries if entry["id"] in lost]),
+    ]
+    return [{"title": title, "views": views} for title, views in groups if views]
+
+
+def _view_number(view: ViewMetrics | None) -> str:
+    if view is None:
+        return ""
+    return f"{view.psnr_db:.2f} dB" if view.posed else f"no camera ({view.psnr_db:.2f} dB at a placeholder)"
 
 
 def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -158,6 +239,9 @@ def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     if config["refine"]["steps"]:
         steps = config["refine"]["steps"]
         rows.append(("Gaussians", f"in all rows of this reconstructor fitted to their pictures for {steps} steps"))
+    rows.append(
+        ("All runs", "make ui opens MLflow with the numbers of this and other runs; its menu Views has the columns")
+    )
     return rows
 
 

@@ -3,28 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+
+from sceneexpander.artifacts.quantities import GEOMETRY, INSERTION, QUALITY, Quantity
 
 LAYERS = (("rgb", "Colour"), ("depth", "Depth"), ("provenance", "Provenance"))
-Better = Literal["higher", "lower", ""]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Column:
-    """One number of the table: its name in `MetricsRow`, its heading, and what it says."""
-
-    name: str
-    label: str
-    meaning: str
-    digits: int = 2
-    better: Better = ""
-    percent: bool = False
-
-    def text(self, value: float | None) -> str:
-        """A value as it is printed; a dash if there is none."""
-        if value is None:
-            return "\u2013"
-        return f"{100 * value:.{self.digits}f} %" if self.percent else f"{value:.{self.digits}f}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,128 +67,16 @@ METHODS = {
     ),
 }
 
-COLUMNS = (
-    Column(
-        name="psnr_db",
-        label="PSNR, dB",
-        better="higher",
-        meaning="Preservation: captured views rendered at the method's own cameras, against the photos; mean over views.",
-    ),
-    Column(name="ssim", label="SSIM", digits=3, better="higher", meaning="The same, structural similarity."),
-    Column(
-        name="st_lpips",
-        label="ST-LPIPS",
-        digits=4,
-        better="lower",
-        meaning="The same, shift-tolerant perceptual distance.",
-    ),
-    Column(
-        name="others_psnr_db",
-        label="PSNR from others, dB",
-        better="higher",
-        meaning="Captured views painted only by what other views contributed: low where surfaces are doubled.",
-    ),
-    Column(
-        name="inserted_psnr_db",
-        label="Inserted PSNR, dB",
-        better="higher",
-        meaning="Expansion: the scene at the inserted camera against the inserted picture.",
-    ),
-    Column(
-        name="inserted_ssim",
-        label="Inserted SSIM",
-        digits=3,
-        better="higher",
-        meaning="The same, structural similarity.",
-    ),
-    Column(
-        name="inserted_st_lpips",
-        label="Inserted ST-LPIPS",
-        digits=4,
-        better="lower",
-        meaning="The same, shift-tolerant perceptual distance.",
-    ),
-    Column(
-        name="inserted_others_psnr_db",
-        label="Inserted from others, dB",
-        better="higher",
-        meaning="The overlap of inserted and captured views: the inserted camera shown only what the captured views contributed.",
-    ),
-    Column(
-        name="navigation_coverage",
-        label="Tour covered",
-        digits=1,
-        percent=True,
-        better="higher",
-        meaning="Share of the tour's pixels that show something.",
-    ),
-    Column(
-        name="truth.camera_rotation_deg",
-        label="Camera error, deg",
-        better="lower",
-        meaning="Against the known cameras: error of relative rotations between captured views.",
-    ),
-    Column(
-        name="truth.depth_abs_rel",
-        label="Depth error",
-        digits=1,
-        percent=True,
-        better="lower",
-        meaning="Against the known depth of the captured views, relative, after one common scale.",
-    ),
-    Column(
-        name="truth.inserted_rotation_deg",
-        label="Inserted camera, deg",
-        better="lower",
-        meaning="Rotation of the inserted camera against the one that the picture was really made with.",
-    ),
-    Column(
-        name="truth.new_region_abs_rel",
-        label="New region's depth error",
-        digits=1,
-        percent=True,
-        better="lower",
-        meaning="Against the known depth of what no captured view saw.",
-    ),
-)
+
+def _shown(quantities: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
+    return tuple(item for item in quantities if item.meaning)
 
 
-# What a look at a running adaptation measures: names as in its entries, ``drift`` being the norm over all modules.
-LOOK_COLUMNS = (
-    Column(
-        name="captured_psnr",
-        label="Captured PSNR, dB",
-        better="higher",
-        meaning="Preservation: a few captured views rendered at the model's own cameras, against the photos.",
-    ),
-    Column(
-        name="inserted_psnr",
-        label="Inserted PSNR, dB",
-        better="higher",
-        meaning="Expansion: the picture above it against the inserted one.",
-    ),
-    Column(
-        name="captured_depth_change",
-        label="Captured depth moved",
-        digits=1,
-        percent=True,
-        better="lower",
-        meaning="Depth of the captured views against what the model believed before the insertion: mean absolute log ratio.",
-    ),
-    Column(
-        name="head_disagreement",
-        label="Heads disagree",
-        digits=1,
-        percent=True,
-        better="lower",
-        meaning="Depth that the model tells against the depth at which it puts its Gaussians: mean absolute log ratio.",
-    ),
-    Column(
-        name="drift",
-        label="Weights moved",
-        digits=3,
-        meaning="Norm of the change of all weights since the round began.",
-    ),
+# The tables of numbers: heading, what the columns say, and the columns. Short enough to be read without scrolling sideways.
+TABLES = (
+    ("The photos", _shown(QUALITY)),
+    ("The inserted view", _shown(INSERTION)),
+    ("Against known truth", _shown(GEOMETRY)),
 )
 
 

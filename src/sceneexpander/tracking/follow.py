@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from sceneexpander.artifacts.live import LOG_NAME, read_live
+from sceneexpander.artifacts.quantities import tracked_look, tracked_step
 from sceneexpander.tracking.config import TrackingConfig
+from sceneexpander.tracking.describe import describe_experiment
 from sceneexpander.tracking.record import flatten
 from sceneexpander.tracking.store import COMPLETE_TAG, LIVE_TAG, open_store, store_lock
 
@@ -92,6 +94,7 @@ class Follower:
                     self._done[identity] = facts["started"]
                     return None
                 client.delete_run(run.info.run_id)
+            describe_experiment(client, experiment)
             name = f"{facts['scene']} r{facts['round']} sceneexpander, running"
             tags = {LIVE_TAG: identity, "scene": facts["scene"], "round": str(facts["round"]), "mlflow.runName": name}
             started_ms = int(1000 * facts["started"])
@@ -116,11 +119,5 @@ class Follower:
 def _numbers(line: Mapping[str, Any]) -> dict[str, float]:
     """Curves of a line, named as in a whole run."""
     if line["kind"] == "step":
-        return {f"loss/{key}": float(value) for key, value in line.items() if isinstance(value, float)}
-    return look_numbers(line) if line["kind"] == "look" else {}
-
-
-def look_numbers(look: Mapping[str, Any]) -> dict[str, float]:
-    """Curves of a look: its numbers, and the drift of every module."""
-    numbers = {f"look/{key}": float(value) for key, value in look.items() if isinstance(value, float)}
-    return numbers | {f"drift/{module}": float(value) for module, value in look["drift"].items()}
+        return tracked_step(line)
+    return tracked_look(line) if line["kind"] == "look" else {}

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.quantities import tracked_cost, tracked_look, tracked_row, tracked_step
 from sceneexpander.artifacts.store import read_json
-from sceneexpander.tracking.follow import look_numbers
+from sceneexpander.tracking.describe import CAMERAS_TAG, LEFT_OUT_TAG, NOTE_TAG, cut, run_note
 from sceneexpander.tracking.record import RunRecord, flatten, run_key
 from sceneexpander.tracking.store import LIVE_TAG
 
@@ -52,11 +53,8 @@ def _run(
     scene, number, name = folder.name, item["number"], method["name"]
     variant = variant_name(facts["overrides"])
     stages = {stage: entry for stage, entry in item["statistics"].items() if _belongs(stage, name)}
-    metrics = dict(row.numbers())
-    metrics |= {f"time/{stage.partition('-')[0]}_s": float(entry["wall_s"]) for stage, entry in stages.items()}
-    if stages:
-        metrics["memory/peak_rss_mb"] = max(float(entry["peak_rss_mb"]) for entry in stages.values())
     adapted = name == "sceneexpander"
+    cameras = _cameras(facts, item, name)
     return RunRecord(
         key=run_key(facts["config"], facts["overrides"], row.numbers(), scene, number, name, row.weights_sha256),
         name=f"{scene} r{number} {name}" + ("" if variant == "default" else f" [{variant}]"),
@@ -69,9 +67,8 @@ def _run(
             "prompt": item["prompt"],
             **flatten(facts["config"]),
         },
-        metrics=metrics,
-        series={f"loss/{key}": tuple(values) for key, values in item["series"].items()} if adapted else {},
-        sparse=_looks(item) if adapted else {},
+        metrics=tracked_row(row) | tracked_cost({stage.partition("-")[0]: entry for stage, entry in stages.items()}),
+        curves=_curves(item) if adapted else {},
         artefacts=_artefacts(item, method, folder, extra) | (_look_pictures(item, folder) if adapted else {}),
         tags={
             "scene": scene,
@@ -82,6 +79,8 @@ def _run(
             "weights_sha256": row.weights_sha256,
             "base_weights_sha256": str(facts["model"]["weights_sha256"]),
             "mlflow.source.git.commit": commit,
+            NOTE_TAG: run_note(item["prompt"], name, row, cameras, item["warnings"]),
+            **_camera_tags(cameras),
             **({LIVE_TAG: item["looks"]["identity"]} if adapted and item["looks"] else {}),
         },
         started_ms=int(1000 * min((entry["started"] for entry in stages.values()), default=0.0)),
@@ -89,12 +88,28 @@ def _run(
     )
 
 
-def _looks(item: Mapping[str, Any]) -> dict[str, list[tuple[int, float]]]:
-    """Curves of what the adaptation's looks saw."""
+def _cameras(facts: Mapping[str, Any], item: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
+    """What is known of the cameras that a method was given; None where nothing is."""
+    given: Mapping[str, Any] | None = facts["cameras"] if method == "captured" else item["cameras"]
+    return given
+
+
+def _camera_tags(cameras: Mapping[str, Any] | None) -> dict[str, str]:
+    if cameras is None:
+        return {}
+    return {CAMERAS_TAG: cut(cameras["summary"]), LEFT_OUT_TAG: str(len(cameras["views"]) - cameras["posed"])}
+
+
+def _curves(item: Mapping[str, Any]) -> dict[str, list[tuple[int, float]]]:
+    """Curves of the adaptation's steps, and of what its looks saw."""
+    series = item["series"]
+    steps = [dict(zip(series, values, strict=True)) for values in zip(*series.values(), strict=True)]
+    points = [(number, tracked_step(step)) for number, step in enumerate(steps, 1)]
+    points += [(look["step"], tracked_look(look)) for look in (item["looks"]["entries"] if item["looks"] else ())]
     curves: dict[str, list[tuple[int, float]]] = {}
-    for look in item["looks"]["entries"] if item["looks"] else ():
-        for name, value in look_numbers(look).items():
-            curves.setdefault(name, []).append((look["step"], value))
+    for step, numbers in points:
+        for name, value in numbers.items():
+            curves.setdefault(name, []).append((step, value))
     return curves
 
 
@@ -115,7 +130,13 @@ def _unavailable(
         name=f"{scene} r{number} {name}: {method['reason']}" + ("" if variant == "default" else f" [{variant}]"),
         params={**identity, "scene_name": scene, "prompt": item["prompt"], **flatten(facts["config"])},
         metrics={},
-        tags={**identity, "scene": scene, "unavailable": method["reason"], "mlflow.source.git.commit": commit},
+        tags={
+            **identity,
+            "scene": scene,
+            "unavailable": method["reason"],
+            "mlflow.source.git.commit": commit,
+            NOTE_TAG: run_note(item["prompt"], name, None, None, [method["reason"]]),
+        },
     )
 
 
@@ -137,5 +158,7 @@ def _artefacts(
         found |= {"stills/" + Path(path).name: folder / path for layer, path in still.items() if layer != "frame"}
     found |= {"views/" + Path(path).name: folder / path for path in method["view_pictures"].values()}
     found["metrics.json"] = folder / method["metrics"]
+    if item["problems"]:
+        found["cameras.txt"] = folder / item["problems"]
     found |= {path.name: path for path in extra}
     return found

@@ -19,8 +19,7 @@ class RunRecord:
         name: as shown in lists.
         params: resolved configuration, dotted keys.
         metrics: final numbers.
-        series: one value per step.
-        sparse: (step, value) where there is not one per step.
+        curves: (step, value), in ascending order.
         artefacts: files by their path in the run; pictures are shown by the interface as such.
         tags: facts to filter by.
         started_ms: epoch milliseconds of the work itself (not of the recording), so that repeating the recording gives the same run.
@@ -31,8 +30,7 @@ class RunRecord:
     name: str
     params: Mapping[str, str]
     metrics: Mapping[str, float]
-    series: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    sparse: Mapping[str, Sequence[tuple[int, float]]] = field(default_factory=dict)
+    curves: Mapping[str, Sequence[tuple[int, float]]] = field(default_factory=dict)
     artefacts: Mapping[str, Path] = field(default_factory=dict)
     tags: Mapping[str, str] = field(default_factory=dict)
     started_ms: int = 0

@@ -7,12 +7,13 @@ import fcntl
 import logging
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from sceneexpander.errors import UserError
 from sceneexpander.tracking.config import TrackingConfig
+from sceneexpander.tracking.describe import describe_experiment
 from sceneexpander.tracking.record import RunRecord
 
 _log = logging.getLogger(__name__)
@@ -20,6 +21,9 @@ _log = logging.getLogger(__name__)
 KEY_TAG = "run_key"
 LIVE_TAG = "adaptation"  # identity of the adaptation that a run mirrors or holds, see `sceneexpander.tracking.follow`
 COMPLETE_TAG = "complete"  # set last: a recording that was killed half-way is done again
+NAMES = (
+    "2"  # its value: the scheme of the metrics' names; a run that has other names gives way when it is recorded again
+)
 _PARAMS_PER_CALL = 100  # limits of MLflow's batch call
 _METRICS_PER_CALL = 1000
 _PARAM_LENGTH = 6000
@@ -73,7 +77,8 @@ def record_runs(
         if not missing and sweep is None:
             return 0, len(records)
         client, experiment = open_store(config, root)
-        known |= _complete(client, experiment)
+        describe_experiment(client, experiment)
+        known |= _complete(client, experiment, {record.key for record in records})
         missing = [record for record in records if record.key not in known]
         for record in missing:
             known[record.key] = _record(client, experiment, record)
@@ -95,11 +100,11 @@ def _complete_local(root: Path, config: TrackingConfig) -> dict[str, str]:
         JOIN tags AS key ON key.run_uuid = runs.run_uuid AND key.key = ?
         JOIN tags AS done ON done.run_uuid = runs.run_uuid AND done.key = ?
         JOIN experiments ON experiments.experiment_id = runs.experiment_id
-        WHERE runs.lifecycle_stage = 'active' AND experiments.name = ?
+        WHERE runs.lifecycle_stage = 'active' AND done.value = ? AND experiments.name = ?
     """
     try:
         with contextlib.closing(sqlite3.connect(path)) as database:
-            return dict(database.execute(query, (KEY_TAG, COMPLETE_TAG, config.experiment)).fetchall())
+            return dict(database.execute(query, (KEY_TAG, COMPLETE_TAG, NAMES, config.experiment)).fetchall())
     except sqlite3.DatabaseError:
         return {}  # an empty or half-made file: MLflow will say what it thinks of it
 
@@ -126,17 +131,43 @@ def open_store(config: TrackingConfig, root: Path) -> tuple[Any, str]:
         raise UserError(f"cannot be used ({first})", where=f"tracking.uri {config.uri}") from None
 
 
-def _complete(client: Any, experiment: str) -> dict[str, str]:
-    """Run ids by key; half-recorded runs are deleted on the way."""
+def last_experiment(root: Path) -> str:
+    """Id of the local store's experiment with the latest run, straight from the database; the first one that is made, without runs."""
+    query = "SELECT experiment_id FROM runs WHERE lifecycle_stage = 'active' ORDER BY start_time DESC LIMIT 1"
+    try:
+        with contextlib.closing(sqlite3.connect(database_path(root))) as database:
+            found = database.execute(query).fetchone()
+    except sqlite3.DatabaseError:
+        found = None
+    return "1" if found is None else str(found[0])  # 0 is MLflow's own default
+
+
+def describe_experiments(config: TrackingConfig, root: Path) -> None:
+    """Bring descriptions and saved views of the experiments that are there up to date: of all in the local store, of the named one else.
+
+    Raises:
+        UserError: the server cannot be reached or refuses.
+    """
+    if config.uri == "off" or (config.uri == "local" and not database_path(root).is_file()):
+        return
+    client, named = open_store(config, root)
+    local = [item.experiment_id for item in client.search_experiments()] if config.uri == "local" else []
+    for experiment in {named, *local} - {"0"}:
+        describe_experiment(client, experiment)
+
+
+def _complete(client: Any, experiment: str, wanted: Collection[str]) -> dict[str, str]:
+    """Run ids by key. Half-recorded runs are deleted on the way, and those of ``wanted`` that have the names of an earlier version."""
     found: dict[str, str] = {}
     token = None
     while True:
         page = client.search_runs([experiment], max_results=1000, page_token=token)
         for run in page:
             key = run.data.tags.get(KEY_TAG)
-            if key is not None and COMPLETE_TAG in run.data.tags:
+            names = run.data.tags.get(COMPLETE_TAG)
+            if key is not None and names == NAMES:
                 found[key] = run.info.run_id
-            elif key is not None:
+            elif key is not None and (names is None or key in wanted):
                 client.delete_run(run.info.run_id)
         token = page.token
         if not token:
@@ -162,11 +193,8 @@ def _record(client: Any, experiment: str, record: RunRecord) -> str:
     params = [Param(key, str(value)[:_PARAM_LENGTH]) for key, value in sorted(record.params.items())]
     end = record.started_ms + record.duration_ms
     metrics = [Metric(key, value, end, 0) for key, value in sorted(record.metrics.items())]
-    for key, values in sorted(record.series.items()):
+    for key, points in sorted(record.curves.items()):
         # Steps are spread over the run's time: MLflow orders equal times arbitrarily.
-        pace = record.duration_ms / max(len(values), 1)
-        metrics += [Metric(key, v, record.started_ms + int(i * pace), i + 1) for i, v in enumerate(values)]
-    for key, points in sorted(record.sparse.items()):
         pace = record.duration_ms / max(max((step for step, _ in points), default=1), 1)
         metrics += [Metric(key, v, record.started_ms + int(step * pace), step) for step, v in points]
     for start in range(0, len(params), _PARAMS_PER_CALL):
@@ -177,5 +205,5 @@ def _record(client: Any, experiment: str, record: RunRecord) -> str:
         folder, _, _ = place.rpartition("/")
         client.log_artifact(run_id, str(path), folder or None)
     client.set_terminated(run_id, end_time=end)
-    client.set_tag(run_id, COMPLETE_TAG, "1")
+    client.set_tag(run_id, COMPLETE_TAG, NAMES)
     return run_id

@@ -102,6 +102,22 @@ def test_a_moved_camera() -> None:
     assert found.camera_direction_deg == 90
 
 
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_a_captured_view_without_a_pose_is_in_no_error(lost: int) -> None:
+    right = made()
+    poses, depth = right.world_from_cam.clone(), right.depth.clone()
+    poses[lost] = torch.eye(4)
+    poses[lost, :3, 3] = torch.tensor([0.2, 2.0, -1.0])
+    depth[lost] *= 1.5
+    scene = dataclasses.replace(right, world_from_cam=poses, depth=depth)
+    views, truth = own_pictures(right), truth_of(right)
+    assert (errors(scene, views, truth).depth_abs_rel or 0) > 0.05
+    posed = torch.arange(4) != lost
+    found = errors(dataclasses.replace(scene, posed=posed), views, truth)
+    assert found.camera_direction_deg == pytest.approx(0, abs=1e-3)
+    assert found.depth_abs_rel == pytest.approx(0, abs=1e-5)
+
+
 def test_only_the_view_of_this_round_counts_as_inserted() -> None:
     scene = made()
     found = against_truth(scene, own_pictures(scene), truth_of(scene), round_number=2)

@@ -162,6 +162,26 @@ def test_captured_only_row() -> None:
     assert row.navigation_coverage is None
 
 
+@pytest.mark.parametrize("lost", [(0,), (1,), (2,), (0, 2), (0, 1)])
+def test_views_without_a_pose_are_measured_but_in_no_mean(lost: tuple[int, ...]) -> None:
+    scene = made_reconstruction()
+    scene = dataclasses.replace(scene, posed=torch.tensor([view not in lost for view in range(3)]))
+    views = own_pictures(scene)
+    images = views.images.clone()
+    for view, factor in ((0, 0.9), (1, 0.5)):  # different numbers for the two photos
+        images[view] = images[view] * factor
+    row = evaluate(scene, dataclasses.replace(views, images=images), CONFIG, scene="m", round_number=1, seed=0)
+    by_id = {view.view_id: view for view in row.views}
+    assert sorted(by_id) == ["000", "001", "002"]
+    kept = [i for i in (0, 1) if i not in lost]
+    assert (row.captured_views, row.captured_views_posed) == (2, len(kept))
+    for name in ("psnr_db", "ssim", "coverage", "others_psnr_db"):
+        counted = [getattr(by_id[f"{i:03d}"], name) for i in kept or (0, 1)]
+        assert getattr(row, name) == pytest.approx(sum(counted) / len(counted))
+    assert (row.inserted_psnr_db is None) is (2 in lost)
+    assert by_id["002"].posed is (2 not in lost)
+
+
 def test_only_the_view_of_this_round_counts_as_inserted() -> None:
     scene = made_reconstruction()
     row = evaluate(scene, own_pictures(scene), CONFIG, scene="m", round_number=2, seed=0)

@@ -23,8 +23,8 @@ from sceneexpander.optimisation.refine import RefineReport
 from sceneexpander.rendering import RenderConfig, produce_renders
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene, write_page
 from sceneexpander.report.course import fits
-from sceneexpander.report.curve import loss_curve
-from sceneexpander.report.words import COLUMNS
+from sceneexpander.report.curve import Curve, curve_chart, objective_curves
+from sceneexpander.report.words import TABLES
 from sceneexpander.tracking import scene_runs
 from sceneexpander.viewer.packed import pack_splats
 from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
@@ -133,7 +133,10 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
         folder / "stats" / "adapt.json",
         {"started": 1.7e9, "wall_s": 2.0, "cpu_s": 2.0, "peak_rss_mb": 99.0, "host": host},
     )
-    write_json_atomic(folder / "log.json", [{"loss": 2.0 / step, "drift": 0.0} for step in (1, 2, 3)])
+    write_json_atomic(
+        folder / "log.json",
+        [{"loss": 2.0 / step, "inserted": step == 2, "gen_depth": 0.5 * (step == 2)} for step in (1, 2, 3)],
+    )
     save_looks(folder, [look(0, 22.25), look(40, 21.5)], [HARM])
     write_json_atomic(folder / "acceptance.json", FITTING)
     write_json_atomic(folder / "captured" / "refinement.json", RefineReport(steps=80, before=0.082, after=0.0312))
@@ -230,9 +233,11 @@ def test_it_says_what_rows_and_columns_mean_and_what_went_wrong(page: Path) -> N
     assert "SceneExpander on mini" in html
     assert "WorldMirror" not in html
     assert "ceiling of preservation" in html
-    shown = [column for column in COLUMNS if column.name in {"psnr_db", "ssim", "inserted_psnr_db"}]
-    for column in shown:
-        assert column.meaning.split(":")[0] in html
+    shown = [item for _, table in TABLES for item in table if item.name in {"psnr_db", "ssim", "inserted_psnr_db"}]
+    assert len(shown) == 3
+    for item in shown:
+        assert item.meaning.split(":")[0] in html
+        assert f'>{item.heading}<span class="arrow">' in html
     assert "backbone: no camera could be estimated for v2" in html
     assert "is blurred" in html
     assert "not for resale" in html, "a method with weights of its own says whose they are"
@@ -245,31 +250,38 @@ def test_a_method_that_could_not_be_run_says_why_where_its_numbers_would_be(page
     assert not re.search(r">[\d.]+<", lacking), "no number"
 
 
+def test_every_number_has_its_name_and_its_unit_for_narrow_screens(page: Path) -> None:
+    table = page.read_text().split("<tbody>")[1].split("</tbody>")[0]
+    cells = re.findall(r'data-label="([^"]*)"><span>([^<]*)(?:<span class="unit"> (\w+)</span>)?', table)
+    assert ("PSNR \u2191", "22.00", "dB") in cells
+    assert ("SSIM \u2191", "0.500", "") in cells
+
+
 def test_bold_compares_methods_with_the_inserted_view(page: Path) -> None:
     table = page.read_text().split("<tbody>")[1].split("</tbody>")[0]
-    bold = re.findall(r'<td class="best">([^<]+)</td>', table)
+    bold = re.findall(r'<td class="best"[^>]*><span>([^<]+)<', table)
     assert "22.00" in bold
     assert "20.00" not in bold, "captured only is a ceiling, not a competitor"
 
 
-def looks_of(page: Path) -> str:
-    (table,) = re.findall(r'<table class="looks">.*?</table>', page.read_text(), re.DOTALL)
-    return table
+def looks_of(page: Path) -> list[str]:
+    """One text per look."""
+    return re.findall(r'<figure class="look">.*?</figure>', page.read_text(), re.DOTALL)
 
 
 def test_looks_show_the_inserted_view_step_by_step_with_their_numbers(page: Path) -> None:
-    table = looks_of(page)
-    headings = re.findall(r"<th>([^<]*)</th>", table.split("</thead>")[0])
-    assert headings == ["", "inserted picture", "before the first step", "after step 40"]
-    rows = dict(re.findall(r'<th scope="row"[^>]*>([^<]*)</th>(.*?)</tr>', table, re.DOTALL))
-    places = {kind: [f"{kind}_0000.jpg", f"{kind}_0040.jpg"] for kind in ("inserted", "depth")}
-    assert re.findall(r'looks/([^"]+)"', rows["render"]) == places["inserted"]
-    assert re.findall(r'looks/([^"]+)"', rows["depth"]) == places["depth"]
-    numbers = {name: re.sub("<[^>]+>", " ", cells).split() for name, cells in rows.items()}
-    assert numbers["Captured PSNR, dB"] == ["22.25", "21.50", "-0.75"], "what was lost stands beside it"
-    assert numbers["Inserted PSNR, dB"] == ["18.00", "18.40", "+0.40"]
-    assert numbers["Captured depth moved"] == ["3.4", "%", "3.4", "%"]
-    assert numbers["Weights moved"] == ["0.000", "2.000"], "the norm over both modules"
+    cards = looks_of(page)
+    assert [re.findall(r"<b>(.*?)</b>", card) for card in cards] == [["before the first step"], ["after step 40"]]
+    for card, step in zip(cards, ("0000", "0040"), strict=True):
+        assert re.findall(r'looks/([^"]+)"', card) == [f"inserted_{step}.jpg", f"depth_{step}.jpg"]
+    found = [re.findall(r"<li><span>(.*?)</span> <span>(.*?)</span></li>", card) for card in cards]
+    first, last = ({name: re.sub("<[^>]+>", "", text) for name, text in numbers} for numbers in found)
+    assert (first["Captured PSNR"], last["Captured PSNR"]) == ("22.25 dB", "21.50 dB -0.75"), (
+        "what was lost stands beside it"
+    )
+    assert (first["Inserted PSNR"], last["Inserted PSNR"]) == ("18.00 dB", "18.40 dB +0.40")
+    assert (first["Captured depth moved"], last["Captured depth moved"]) == ("3.4 %", "3.4 %")
+    assert (first["Weights moved"], last["Weights moved"]) == ("0.000", "2.000"), "the norm over both modules"
 
 
 def test_harm_is_said_where_it_shows_and_with_the_rounds_warnings(page: Path) -> None:
@@ -314,12 +326,12 @@ def test_a_view_that_does_not_fit_is_a_warning(source: SceneSource, tmp_path: Pa
 @pytest.mark.parametrize("saved", ["nothing", "no looks"])
 def test_without_looks_the_page_is_silent_about_them(source: SceneSource, tmp_path: Path, saved: str) -> None:
     state = tmp_path / "state"
-    write_json_atomic(state / "log.json", [{"loss": 1.0}])
+    write_json_atomic(state / "log.json", [{"loss": 1.0, "inserted": True}])
     if saved == "no looks":
         save_looks(state, [], [])
     methods = [replace(method, refinement=None) for method in source.rounds[0].methods]
     html = written(source, replace(source.rounds[0], log=state / "log.json", methods=methods), tmp_path)
-    assert 'class="looks"' not in html
+    assert 'class="look' not in html
     assert "inserted view was found" not in html
     assert "Gaussians of" not in html
     assert "<h3>Adaptation" in html
@@ -357,11 +369,15 @@ def test_runs_to_track_come_from_the_same_folder(gathered: Path, tmp_path: Path)
     assert set(runs) == set(METHODS)
     assert len({run.key for run in (*runs.values(), lacking)}) == 4
     adapted = runs["sceneexpander"]
-    assert adapted.sparse["look/captured_psnr"] == [(0, 22.25), (40, 21.5)]
+    assert adapted.curves["5_look/psnr_captured_db"] == [(0, 22.25), (40, 21.5)]
     assert len([place for place in adapted.artefacts if place.startswith("looks/")]) == 6
-    assert adapted.series["loss/loss"] == (2.0, 1.0, 2.0 / 3)
-    assert not runs["backbone"].series
-    assert adapted.metrics["psnr_db"] == 22.0
+    assert adapted.curves["4_loss/objective_without_inserted"] == [(1, 2.0), (3, 2.0 / 3)]
+    assert adapted.curves["4_loss/objective_with_inserted"] == [(2, 1.0)]
+    assert adapted.curves["4_loss/inserted_depth"] == [(2, 0.5)], "zero is no loss where there is nothing to lose"
+    assert not runs["backbone"].curves
+    assert adapted.metrics["1_quality/psnr_captured_db"] == 22.0
+    assert "PSNR **22.00 dB**; Inserted PSNR **11.00 dB**." in adapted.tags["mlflow.note.content"]
+    assert "is blurred" in adapted.tags["mlflow.note.content"]
     assert adapted.params["adapt.steps"] == "3"
     assert adapted.tags["reconstructor"] == "mini"
     assert (adapted.started_ms, adapted.duration_ms) == (1_700_000_000_000, 2000)
@@ -378,7 +394,40 @@ def test_facts_hold_no_absolute_path(gathered: Path) -> None:
     assert read_json(gathered / "page.json")["rounds"][0]["backend"] == "replay"
 
 
+@pytest.mark.parametrize(
+    ("inserted", "wanted"),
+    [
+        ([True, False, True, False], {"with": [1, 3], "without": [2, 4]}),
+        ([True] * 4, {"with": [1, 2, 3, 4]}),
+        ([False] * 4, {"without": [1, 2, 3, 4]}),
+        ([True, False, True, True], {"with": [1, 4], "without": [2]}),
+    ],
+)
+def test_steps_with_and_without_the_inserted_view_are_curves_of_their_own(
+    inserted: list[bool], wanted: dict[str, list[int]]
+) -> None:
+    lost = float("nan") if inserted == [True, False, True, True] else 3.0
+    curves = objective_curves({"loss": [1.0, 2.0, lost, 4.0], "inserted": inserted})
+    assert {curve.name: [step for step, _ in curve.points] for curve in curves} == wanted
+    chart = curve_chart(curves, 4)
+    assert chart.count("<polyline") == len(wanted)
+    assert chart.count("<circle") == sum(len(steps) for steps in wanted.values())
+
+
+def test_the_page_names_both_curves(page: Path) -> None:
+    assert re.findall(r'<span class="key (\w+)">', page.read_text()) == ["with", "without"]
+
+
+def test_curves_share_their_axes() -> None:
+    high = Curve(name="with", title="", points=((1, 10.0), (3, 10.0)))
+    low = Curve(name="without", title="", points=((2, 5.0), (4, 5.0)))
+    both = curve_chart([high, low], 4)
+    heights = [float(y) for y in re.findall(r'cy="([\d.]+)"', both)]
+    assert heights[0] == heights[1] < heights[2] == heights[3]
+
+
 def test_a_curve_of_nothing_is_nothing() -> None:
-    assert loss_curve([]) == ""
-    assert loss_curve([float("nan")]) == ""
-    assert "polyline" in loss_curve([1.0, 1.0])
+    assert objective_curves({}) == []
+    assert objective_curves({"loss": [float("nan")], "inserted": [True]}) == []
+    assert curve_chart([], 3) == ""
+    assert "polyline" in curve_chart(objective_curves({"loss": [1.0, 1.0], "inserted": [True, True]}), 2)

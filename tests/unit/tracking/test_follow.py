@@ -13,10 +13,11 @@ import pytest
 from sceneexpander.artifacts.live import LOG_NAME, LiveLog, read_live
 from sceneexpander.tracking import record_runs
 from sceneexpander.tracking.follow import STALE_S, Follower
-from sceneexpander.tracking.store import LIVE_TAG
+from sceneexpander.tracking.store import LIVE_TAG, NAMES
 from tests.unit.tracking.test_store import CONFIG, client, record, runs
 
 FACTS = {"scene": "room", "round": 1, "steps": 3, "sections": {"adapt": {"steps": 3}}}
+OBJECTIVE, LOOKED = "4_loss/objective_with_inserted", "5_look/psnr_captured_db"
 LOOK = {"step": 0, "captured_psnr": 20.0, "inserted_psnr": 15.5, "drift": {"network.trunk": 0.25}}
 
 
@@ -50,8 +51,8 @@ def test_a_running_adaptation_shows_and_is_finished(root: Path) -> None:
     (run,) = runs(root)
     assert run.info.status == "RUNNING"
     assert run.data.params["adapt.steps"] == "3"
-    assert _history(root, run, "loss/loss") == [(1, 1.0)]
-    assert _history(root, run, "drift/network.trunk") == [(0, 0.25)]
+    assert _history(root, run, OBJECTIVE) == [(1, 1.0)]
+    assert _history(root, run, "6_drift/network.trunk") == [(0, 0.25)]
     looks = root / "live" / "abc" / "looks"
     looks.mkdir()
     (looks / "inserted_0000.jpg").write_bytes(b"picture")
@@ -60,7 +61,7 @@ def test_a_running_adaptation_shows_and_is_finished(root: Path) -> None:
     follower.poll()
     (run,) = runs(root)
     assert run.info.status == "FINISHED"
-    assert _history(root, run, "loss/loss") == [(1, 1.0), (2, 0.5)]
+    assert _history(root, run, OBJECTIVE) == [(1, 1.0), (2, 0.5)]
     assert [item.path for item in client(root).list_artifacts(run.info.run_id, "looks")] == ["looks/inserted_0000.jpg"]
     assert follower.poll() == 0
 
@@ -76,19 +77,19 @@ def test_a_resumed_adaptation_and_a_new_follower_start_the_run_anew(root: Path) 
     for one in (follower, Follower(root / "live", root, CONFIG)):
         one.poll()
         (run,) = runs(root)
-        assert _history(root, run, "loss/loss") == [(1, 1.0), (2, 0.5)]
+        assert _history(root, run, OBJECTIVE) == [(1, 1.0), (2, 0.5)]
 
 
 def test_the_whole_run_replaces_the_mirrored_one(root: Path) -> None:
     log, follower = _log(root), Follower(root / "live", root, CONFIG)
     log.write("step", _step(1))
     follower.poll()
-    whole = replace(record(root, "a"), tags={LIVE_TAG: "abc"}, sparse={"look/captured_psnr": [(0, 20.0), (3, 21.0)]})
+    whole = replace(record(root, "a"), tags={LIVE_TAG: "abc"}, curves={LOOKED: [(0, 20.0), (3, 21.0)]})
     for _ in range(2):
         record_runs([whole], CONFIG, root)
         (run,) = runs(root)
-        assert run.data.tags["complete"] == "1"
-        assert _history(root, run, "look/captured_psnr") == [(0, 20.0), (3, 21.0)]
+        assert run.data.tags["complete"] == NAMES
+        assert _history(root, run, LOOKED) == [(0, 20.0), (3, 21.0)]
         log.write("step", _step(2))
         for one in (follower, Follower(root / "live", root, CONFIG)):
             one.poll()
