@@ -7,7 +7,6 @@ The methods are those that the project selects.
 from __future__ import annotations
 
 import argparse
-import logging
 import re
 import shutil
 import sys
@@ -26,7 +25,6 @@ from sceneexpander.project import find_project
 from sceneexpander.workspace import Selection, make_workspace, merged_overrides, read_selection, reproduce
 
 SCENE_FILE = "scene.yaml"
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,8 +94,6 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
     captured = target / "captured"
     captured.mkdir(parents=True)
     survey = survey_pictures(photos)
-    for note in survey.notes:
-        logger.warning("%s", note)
     for path in survey.pictures:
         shutil.copyfile(path, captured / path.name)
     rounds = []
@@ -115,7 +111,9 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
         shutil.copyfile(source, target / copy)
         words_of_round = {"prompt": spec.prompt, "motion": spec.motion, "object": spec.new_object}
         rounds.append({**{key: text for key, text in words_of_round.items() if text}, "inserted": copy.as_posix()})
-    text = yaml.safe_dump({"name": name, "rounds": rounds}, sort_keys=False, allow_unicode=True)
+    # The copy holds nothing but photos: what else was there is told by the notes alone.
+    content = {"name": name, "rounds": rounds, **({"notes": list(survey.notes)} if survey.notes else {})}
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     (target / SCENE_FILE).write_text(text, encoding="utf-8")
 
 

@@ -83,14 +83,17 @@ def test_photos_that_are_no_folder(tmp_path: Path, folder: Path, photos: str) ->
     refusal(tmp_path, str(tmp_path / photos), "--inserted", str(tmp_path / "bench.png"), "--prompt", "A bench.")
 
 
-def test_files_that_are_no_photos_are_named_before_the_copy(
+def test_files_that_are_not_copied_are_still_told(
     tmp_path: Path, folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (folder / "film.mov").write_bytes(b"x")
+    (folder / "film: #1, it's\n.mov").write_bytes(b"x")
+    arguments = (str(folder), "--inserted", str(tmp_path / "bench.png"), "--prompt", "A bench.")
+    stage_scene(parse_arguments(arguments), "x", tmp_path / "scene")
     with caplog.at_level(logging.WARNING):
-        arguments = (str(folder), "--inserted", str(tmp_path / "bench.png"), "--prompt", "A bench.")
-        stage_scene(parse_arguments(arguments), "x", tmp_path / "scene")
-    assert "2 of 3 files are photos; 1 skipped: film.mov (a video)" in caplog.text
+        scene = load_scene(tmp_path / "scene", IngestConfig(long_side_px=112))
+    note = "2 of 3 files are photos; 1 skipped: film: #1, it's\\n.mov (a video)"
+    assert scene.notes[0] == note
+    assert note in caplog.text
     assert not (tmp_path / "scene" / "captured" / "film.mov").exists()
 
 

@@ -66,7 +66,9 @@ def load_scene(folder: Path, config: IngestConfig, *, name: str | None = None) -
     images = require_inside(folder / facts.images, folder, where=f"{folder / SCENE_FILE}: 'images'")
     survey = survey_pictures(images, inside=folder)
     paths = _ordered(list(survey.pictures), facts.order, folder / SCENE_FILE)
-    return _scene(paths, survey.notes, facts.rounds, config, name or facts.name or folder.resolve().name)
+    return _scene(
+        paths, (*facts.notes, *survey.notes), facts.rounds, config, name or facts.name or folder.resolve().name
+    )
 
 
 def load_photos(folder: Path, rounds: Sequence[RoundSpec], config: IngestConfig, *, name: str | None = None) -> Scene:

@@ -17,14 +17,17 @@ from sceneexpander.plainfiles import read_plain_file
 from sceneexpander.yamlfile import read_user_yaml
 
 SCENE_FILE = "scene.yaml"
-_SCENE_KEYS = frozenset({"name", "source", "licence", "rounds", "order", "images"})
+_SCENE_KEYS = frozenset({"name", "source", "licence", "rounds", "order", "images", "notes"})
 _ROUND_KEYS = frozenset({"prompt", "motion", "object", "inserted"})
 _SENTENCES = frozenset({"prompt", "motion", "object"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneFile:
-    """The content of ``scene.yaml``, checked. ``images`` is the folder of the captured photos, relative to the scene's."""
+    """The content of ``scene.yaml``, checked. ``images`` is the folder of the captured photos, relative to the scene's.
+
+    ``notes`` were made when the folder was put together from other files, which are not in it.
+    """
 
     name: str | None
     source: str
@@ -32,6 +35,7 @@ class SceneFile:
     images: str
     order: tuple[str, ...]  # file names that come first, in this order; empty: natural order
     rounds: tuple[RoundSpec, ...]
+    notes: tuple[str, ...] = ()
 
 
 def read_scene_file(folder: Path) -> SceneFile:
@@ -57,6 +61,7 @@ def read_scene_file(folder: Path) -> SceneFile:
         licence=_text(content, "licence", path, "the file"),
         images=_existing(folder, images, f"{path}: 'images'") if images else "captured",
         order=_names(content.get("order"), path),
+        notes=_notes(content.get("notes"), path),
         rounds=tuple(_round(folder, path, item, number) for number, item in enumerate(rounds, start=1)),
     )
 
@@ -90,6 +95,12 @@ def _names(value: object, path: Path) -> tuple[str, ...]:
     if len({same_name(item) for item in value}) != len(value):
         raise UserError("'order' names a file twice", where=path)
     return tuple(value)
+
+
+def _notes(value: object, path: Path) -> tuple[str, ...]:
+    if value is not None and not (isinstance(value, list) and all(isinstance(item, str) for item in value)):
+        raise UserError("'notes' must be a list of texts", where=path)
+    return tuple(printable(item) for item in value or ())
 
 
 def same_name(name: str) -> str:

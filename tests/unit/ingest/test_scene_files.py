@@ -89,7 +89,7 @@ def test_linked_folders_are_refused(folder: Path, tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize(
-    "target", [f".dvc/cache/files/md5/{DIGEST}", f".dvc/cache/{DIGEST}", f"../shared/files/md5/{DIGEST}"]
+    "target", [f".dvc/cache/files/md5/{DIGEST}", f".dvc/cache/{DIGEST}", f"../company/files/md5/{DIGEST}"]
 )
 def test_links_into_the_cache_of_dvc_are_files(folder: Path, target: str) -> None:
     stored = photo(folder.parents[1] / target, 30)
