@@ -39,6 +39,7 @@ from unlike_photos import CASES, SEEDS, Photo, place_of, write_photo
 
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.errors import UserError
+from sceneexpander.expansion.optics import optics_of
 from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.frontend.prior import picture_judge
 from sceneexpander.frontend.sfm import SfmConfig, SparseReconstruction, estimate_cameras
@@ -214,6 +215,8 @@ def estimate(views: ViewSet, config: SfmConfig, known_intrinsics_px: Tensor | No
         known_intrinsics_px=known_intrinsics_px,
         judge=picture_judge(views.images, DenseConfig(threads=1)),
         names=[record.name for record in views.records],
+        optics=optics_of(views),
+        valid=views.valid,
     )
 
 

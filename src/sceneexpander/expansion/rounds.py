@@ -27,6 +27,7 @@ from sceneexpander.artifacts.scene import KnownCameras, Scene
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.expansion.loaded import LoadedModel
+from sceneexpander.expansion.optics import optics_of
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
 from sceneexpander.geometry.priors import Priors
@@ -69,6 +70,8 @@ def views_priors(
         known_intrinsics_px=None if known is None else known.intrinsics_px,
         known_world_from_cam=known.world_from_cam if complete and known is not None else None,
         names=[record.name for record in views.records],
+        optics=optics_of(views),
+        valid=views.valid,
     )
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from sceneexpander.frontend.sfm_types import SfmConfig
 
@@ -34,6 +34,16 @@ class Features:
     def described(self) -> int:
         """Number of keypoints with a descriptor."""
         return int(self.descriptors.shape[0])
+
+    def where(self, shown: Bool[np.ndarray, "height width"] | None) -> Features:
+        """The keypoints whose pixel is ``shown`` (None: all)."""
+        if shown is None:
+            return self
+        height, width = shown.shape
+        column = np.clip(self.pixel_xy[:, 0].astype(np.int64), 0, width - 1)
+        row = np.clip(self.pixel_xy[:, 1].astype(np.int64), 0, height - 1)
+        keep = shown[row, column]
+        return Features(pixel_xy=self.pixel_xy[keep], descriptors=self.descriptors[keep[: self.described]])
 
     def joined(self, further_xy: Float[np.ndarray, "further 2"]) -> Features:
         """The same keypoints followed by others that have no descriptor."""

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, checked_share, dense_depth
+from sceneexpander.frontend.lenses import ViewOptics
 from sceneexpander.frontend.sfm import Judge, estimate_cameras
 from sceneexpander.frontend.sfm_types import SfmConfig, SparseReconstruction
 from sceneexpander.geometry.priors import Priors
@@ -35,6 +36,8 @@ def build_priors(
     known_world_from_cam: Float[Tensor, "view 4 4"] | None = None,
     focal_hint_px: float | None = None,
     names: Sequence[str] | None = None,
+    optics: Sequence[ViewOptics] | None = None,
+    valid: Bool[Tensor, "view height width"] | None = None,
 ) -> tuple[Priors, SparseReconstruction]:
     """Everything a reconstructor can be told about S >= 1 views; arguments as in `sfm.estimate_cameras`.
 
@@ -49,6 +52,8 @@ def build_priors(
         known_world_from_cam=known_world_from_cam,
         focal_hint_px=focal_hint_px,
         names=names,
+        optics=optics,
+        valid=valid,
         judge=picture_judge(images, config.dense),
     )
     dense = dense_depth(

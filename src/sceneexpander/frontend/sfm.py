@@ -75,6 +75,7 @@ def estimate_cameras(
     names: Sequence[str] | None = None,
     judge: Judge | None = None,
     optics: Sequence[ViewOptics] | None = None,
+    valid: Bool[Tensor, "view height width"] | None = None,
 ) -> SparseReconstruction:
     """Poses, intrinsics and sparse points of S >= 1 views. Never fails on hard images: see ``report`` and ``posed``.
 
@@ -91,6 +92,7 @@ def estimate_cameras(
         names: of the views, for the report.
         optics: per view how it lies on its original and what its file says of the lens; without, all views share one lens and
             are their own originals.
+        valid: which pixels of ``images`` show the place; features elsewhere are not looked at.
         judge: says how well a candidate fits the pictures (higher is better), for `LearnedUse.CHOOSE`: among the candidates that
             pose most views the best one is taken. Repeated windows, stripes and tiles give models that explain their own
             matches well and the pictures badly.
@@ -106,7 +108,9 @@ def estimate_cameras(
     if len(own) != len(images):
         raise ValueError(f"{len(own)} optics for {len(images)} views")
     plan = LensPlan.make(config, setup, known, own, focal_hint_px)
-    model = _model([detect_features(grey, config) for grey in setup.greys], None, known, plan, config, setup)
+    found = [detect_features(grey, config) for grey in setup.greys]
+    features = [own.where(show) for own, show in zip(found, setup.shown(valid), strict=True)]
+    model = _model(features, None, known, plan, config, setup)
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
     if choosing and judge is not None and not known.posed.all():
         candidates = [model, *_learned_models(model, (False, True), known, plan, config, setup)]

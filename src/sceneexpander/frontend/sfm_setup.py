@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -13,6 +14,8 @@ from torch import Tensor
 from sceneexpander.errors import UserError
 from sceneexpander.frontend.features import grey_u8
 from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, SfmConfig
+
+_MASK_MARGIN_PX = 6  # at 768 px: the edge of a mask is no corner of the place
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +39,19 @@ class Setup:
     def long_side(self) -> int:
         """Longer side of the feature images in pixels."""
         return max(self.size)
+
+    def shown(self, valid: Tensor | None) -> list[np.ndarray | None]:
+        """Per view which feature pixels show the place, a keypoint's own surroundings away from those that do not."""
+        if valid is None:
+            return [None] * len(self.greys)
+        height, width = self.size
+        reach = max(1, round(_MASK_MARGIN_PX * self.unit_px))
+        kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+        masks = []
+        for mask in valid.cpu().numpy().astype(np.uint8):
+            large = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
+            masks.append(cv2.erode(large, kernel, borderValue=1).astype(bool))
+        return list(masks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
