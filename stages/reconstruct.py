@@ -8,7 +8,7 @@ from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, initial_state, load_model
+from sceneexpander.expansion import ModelConfig, initial_state, load_model, report_cameras
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.progress import progress_bar
 from stages import layout
@@ -43,7 +43,10 @@ def main(cell: Cell) -> None:
             seed=sections.seed,
             on_step=lambda step, loss: bar.update(step, loss),
         )
+    cameras = None if sparse is None else report_cameras(state.views, sparse)
     with directory_being_written(layout.state(cell.scene, 0)) as folder:
+        if cameras is not None:
+            cameras.save(layout.cameras(folder))
         state.save(folder)
         reconstruction.save(folder / "reconstruction")
         facts = {

@@ -8,7 +8,7 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.state import ExpansionState, save_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_model, refined
+from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_model, refined, report_cameras
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.optimisation.refine import RefineConfig
 from stages import layout
@@ -35,7 +35,9 @@ def main(cell: Cell) -> None:
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
     inserted = InsertedView.load(layout.inserted(cell.scene, cell.round))
     loaded = load_model(sections.model, sections.device)
-    priors, reconstruction, _ = joint_reconstruction(state, inserted, loaded, sections.frontend, seed=sections.seed)
+    priors, reconstruction, sparse = joint_reconstruction(
+        state, inserted, loaded, sections.frontend, seed=sections.seed
+    )
     reconstruction, fit = refined(
         reconstruction,
         state.views.append(inserted.view),
@@ -45,6 +47,8 @@ def main(cell: Cell) -> None:
         device=sections.device,
     )
     with directory_being_written(layout.joint_priors(cell.scene, cell.round)) as folder:
+        if sparse is not None:
+            report_cameras(state.views.append(inserted.view), sparse).save(layout.cameras(folder))
         save_priors(folder, priors)
     with directory_being_written(layout.reconstruction(cell.scene, cell.round, "backbone").parent) as folder:
         reconstruction.save(folder / "reconstruction")

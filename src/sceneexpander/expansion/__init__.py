@@ -1,5 +1,6 @@
 """One round of expansion, put together from the rooms below: state in, state out."""
 
+from sceneexpander.expansion.cameras import report_cameras, straighten_views
 from sceneexpander.expansion.loaded import LoadedModel, ModelConfig, PriorsUse, load_model
 from sceneexpander.expansion.rounds import (
     RoundInputs,
@@ -23,4 +24,6 @@ __all__ = [
     "judge_round",
     "load_model",
     "refined",
+    "report_cameras",
+    "straighten_views",
 ]

@@ -26,6 +26,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import KnownCameras, Scene
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.expansion.cameras import announce_cameras, report_cameras, straighten_views
 from sceneexpander.expansion.loaded import LoadedModel
 from sceneexpander.expansion.optics import optics_of
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
@@ -62,6 +63,10 @@ def views_priors(
     if not loaded.uses_front_end:
         return Priors(), None
     complete = known is not None and known.world_from_cam is not None
+    if any(
+        record.distortion != (0.0, 0.0) for record in views.records
+    ):  # straightened before; what is left is nothing to look for
+        frontend = replace(frontend, sfm=replace(frontend.sfm, distortion_rounds=0))
     return build_priors(
         views.images,
         frontend,
@@ -84,19 +89,26 @@ def initial_state(
     seed: int,
     on_step: Callable[[int, float], None] | None = None,
 ) -> tuple[ExpansionState, Reconstruction, SparseReconstruction | None, WarmupReport | None]:
-    """Round 0: the captured views, their geometry, theta_0 (after the optional warm-up), and what the model makes of them."""
+    """Round 0: the captured views, their geometry, theta_0 (after the optional warm-up), and what the model makes of them.
+
+    The state's views are pinhole pictures: what the lens bent is straightened, here and for all that follows.
+    """
     priors, sparse = views_priors(scene.views, loaded, frontend, seed=seed, known=scene.known)
+    views = scene.views
+    if sparse is not None:
+        views = straighten_views(views, sparse)
+        announce_cameras(report_cameras(views, sparse), strict=frontend.strict)
     loaded.reset()
     report = warm_up(
         loaded.model,
-        scene.views.images.to(loaded.device),
+        views.images.to(loaded.device),
         _device_priors(priors, loaded),
         warmup,
         seed=seed,
         on_step=on_step,
     )
     weights = WeightsChange.between(loaded.base, loaded.state())
-    state = ExpansionState(views=scene.views, priors=priors, weights=weights)
+    state = ExpansionState(views=views, priors=priors, weights=weights)
     return state, reconstruct(state.views, priors, loaded, weights, method="captured"), sparse, report
 
 
@@ -152,6 +164,10 @@ def joint_reconstruction(
     """The baseline: the unadapted model given all views, the inserted one last and treated like any other."""
     views = state.views.append(inserted.view)
     priors, sparse = views_priors(views, loaded, frontend, seed=seed)
+    if sparse is not None:
+        announce_cameras(
+            report_cameras(views, sparse), strict=False
+        )  # a generated view may be left out: that is a result
     return priors, reconstruct(views, priors, loaded, state.weights, method="backbone"), sparse
 
 

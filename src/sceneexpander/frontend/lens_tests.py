@@ -15,6 +15,7 @@ import numpy as np
 from sceneexpander.frontend.bundle import K1, K2, LOG_FOCAL, SHIFT_X, SHIFT_Y, BundleResult
 from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, LensFreedom, OtherView, freedom_of, held_lens
+from sceneexpander.frontend.evidence import other_views
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.resection import rough_poses
@@ -43,7 +44,7 @@ def settle_lenses(mapping: Mapping, features: Sequence[Features], pairs: Sequenc
     """
     if mapping.registered.sum() < 3:
         return False
-    seen = {int(view): _other_views(mapping, int(view), features, pairs) for view in np.flatnonzero(mapping.registered)}
+    seen = {int(view): other_views(mapping, int(view), features, pairs) for view in np.flatnonzero(mapping.registered)}
     checks = [
         _LensCheck(mapping, view, others)
         for view, others in seen.items()
@@ -160,30 +161,6 @@ class _LensCheck:
         rough = rough_poses(mapping.sighting(view, rows), mapping.log_focals_to_try(view, alone=True))
         judged = [self.fit.judge(pose.rotation, pose.translation, pose.lens) for pose in rough]
         return sorted(judged, key=lambda pose: pose.cost)[:_KEEP_BEST]
-
-
-def _other_views(
-    mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]
-) -> list[OtherView]:
-    """The other posed views with their verified matches with this one."""
-    found = []
-    for pair in pairs:
-        if view not in (pair.view_a, pair.view_b) or pair.verified.count == 0:
-            continue
-        first = pair.view_a == view
-        other = pair.view_b if first else pair.view_a
-        mine, theirs = (pair.verified.index_a, pair.verified.index_b)[:: 1 if first else -1]
-        if mapping.registered[other]:
-            found.append(
-                OtherView(
-                    rotation=mapping.rotations[other],
-                    translation=mapping.translations[other],
-                    intrinsics=mapping.intrinsics[other],
-                    own_xy=features[other].pixel_xy[theirs],
-                    view_xy=features[view].pixel_xy[mine],
-                )
-            )
-    return found
 
 
 def _free_shift(mapping: Mapping, lens: int) -> bool:

@@ -212,6 +212,13 @@ class Mapping:
         self.valid &= self.angles_deg() >= self.config.min_angle_deg
         self.active &= self.valid[:, None]
 
+    def leave_out(self, view: int) -> None:
+        """Take a view out of the model, with the points that only it and one other view see."""
+        self.registered[view] = False
+        self.active[:, view] = False
+        self.valid &= self.active.sum(1) >= 2
+        self.active &= self.valid[:, None]
+
     def drop_strays(self) -> None:
         """Drop points of only two views whose depth agrees with none of their neighbours in the image.
 
@@ -408,17 +415,17 @@ class Mapping:
         problem = self._problem(free, prior_sigma, robust_px=noise, pixel_xy=pixel_xy, values=values)
         return None if problem is None else adjust(problem, max_iterations=2 * self.config.bundle_iterations)
 
-    def direction_sigma_deg(self) -> Float[np.ndarray, "view view"]:
+    def direction_sigma_deg(self, *, least_noise_px: float) -> Float[np.ndarray, "view view"]:
         """Standard deviation of the direction from each view to each other, at the present errors; NaN where not registered.
 
-        Errors are correlated, as for priors: they count as fewer than there are.
+        Errors are correlated, as for priors: they count as fewer than there are, and as no smaller than ``least_noise_px`` (at 768 px).
         """
         errors = self.errors_px()[self.active & self.registered]
         views = len(self.registered)
         problem = None
         if len(errors):
-            noise = float(np.median(errors)) / 1.18  # of two dimensions
-            problem = self._problem(self.lenses.free, self.prior_sigma, robust_px=noise / self.unit_px)
+            noise = max(float(np.median(errors)) / 1.18 / self.unit_px, least_noise_px)  # a median of two dimensions
+            problem = self._problem(self.lenses.free, self.prior_sigma, robust_px=noise)
         if problem is None:
             return np.full((views, views), np.nan)
         return direction_sigma_deg(problem) * problem.robust_px * _PRIOR_INFLATION**0.5

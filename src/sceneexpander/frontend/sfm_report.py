@@ -7,13 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from sceneexpander.frontend.bundle import LOG_FOCAL
+from sceneexpander.frontend.bundle import LOG_FOCAL, SHIFT_X, SHIFT_Y
 from sceneexpander.frontend.distortion import Distortion
+from sceneexpander.frontend.evidence import ViewEvidence
 from sceneexpander.frontend.features import Features
+from sceneexpander.frontend.lenses import LensPlan
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.placement import Placement
 from sceneexpander.frontend.sfm_types import FocalSource, PairReport, SfmReport, SparseReconstruction, ViewReport
 from sceneexpander.frontend.sparse_points import SparsePoints
+
+_WORTH_SAYING = 0.03  # of the long side: a principal point nearer to the centre than this is like any other
+_HINT_REJECTED = 0.15  # of the logarithm of the focal
 
 
 def build_reconstruction(
@@ -25,7 +30,11 @@ def build_reconstruction(
     names: Sequence[str],
     scale_xy: np.ndarray,
     *,
-    distortion: Distortion | None = None,
+    distortion: Distortion | None,
+    plan: LensPlan,
+    evidence: dict[int, ViewEvidence],
+    doubts: dict[int, str],
+    unrelated: int | None,
 ) -> SparseReconstruction:
     """Change frame, scale and pixels; write the report.
 
@@ -38,6 +47,10 @@ def build_reconstruction(
         names: of the views.
         scale_xy: pixels of the given images per pixel of the feature images.
         distortion: what the features' pixels were straightened by.
+        plan: which views share a lens, and what their files say.
+        evidence: of views that the model adjusted.
+        doubts: why a posed view is only roughly right.
+        unrelated: the view that is the frame of reference and nothing else, since no other could be placed by it.
     """
     world_from_cam, points, scale = _normalised(mapping)
     rows, views = np.nonzero(mapping.active & mapping.registered)
@@ -57,7 +70,23 @@ def build_reconstruction(
     errors = np.where(mapping.active & mapping.registered, mapping.errors_px(), np.nan) * float(scale_xy.mean())
     angles = mapping.angles_deg()[used]
     report = SfmReport(
-        views=tuple(_view_report(v, names[v], mapping, placed.get(v), features, errors) for v in range(len(names))),
+        views=tuple(
+            _view_report(
+                v,
+                names[v],
+                mapping,
+                placed.get(v),
+                features,
+                errors,
+                distortion,
+                plan,
+                focal_source,
+                evidence.get(v),
+                doubts.get(v, ""),
+                related=v != unrelated,
+            )
+            for v in range(len(names))
+        ),
         pairs=pairs,
         focal_px=float(intrinsics[0, 0, 0]),
         focal_ratio=float(mapping.intrinsics[0, 0, 0] / mapping.shift_unit_px[0, 0]),
@@ -110,20 +139,77 @@ def _view_report(
     placement: Placement | None,
     features: Sequence[Features],
     errors: np.ndarray,
+    distortion: Distortion | None,
+    plan: LensPlan,
+    focal_source: FocalSource,
+    evidence: ViewEvidence | None,
+    doubt: str,
+    *,
+    related: bool,
 ) -> ViewReport:
     """One line of the report."""
     inliers = int((mapping.active[:, view] & mapping.valid).sum()) if mapping.registered[view] else 0
+    lens = mapping.lenses.resolved[mapping.lens_of[view]]
+    shift = (float(lens[SHIFT_X]), float(lens[SHIFT_Y]))
+    k = (0.0, 0.0) if distortion is None else (float(distortion.k[view, 0]), float(distortion.k[view, 1]))
+    shared = mapping.lenses.focal_of[mapping.lens_of[view]] == mapping.lens_of[plan.main]
+    ratio = float(mapping.intrinsics[view, 0, 0] / mapping.shift_unit_px[view, 0])
     return ViewReport(
         view=view,
         name=name,
-        registered=placement is None or placement.loose,
-        loose=placement is not None and placement.loose,
-        reason="" if placement is None else placement.reason,
+        registered=related and (placement is None or placement.loose),
+        loose=(placement is not None and placement.loose) or bool(doubt),
+        reason=doubt if placement is None else placement.reason,
         features=features[view].count,
         inliers=inliers if placement is None else placement.inliers,
         mean_error_px=float(np.nanmean(errors[:, view])) if inliers else float("nan"),
         placed_like=None if placement is None else placement.like,
+        focal_ratio=ratio,
+        focal_source=focal_source if shared else _own_source(mapping, view, plan),
+        distortion=k,
+        centre_shift=shift,
+        warnings=_view_warnings(mapping, view, ratio, shift, shared=bool(shared), plan=plan),
+        agreeing=float("nan") if evidence is None else evidence.agreeing,
+        rotation_gap_deg=float("nan") if evidence is None else evidence.rotation_gap_deg,
+        direction_sigma_deg=float("nan") if evidence is None else evidence.direction_sigma_deg,
     )
+
+
+def _own_source(mapping: Mapping, view: int, plan: LensPlan) -> FocalSource:
+    """Where the focal of a lens beside the main one came from."""
+    if mapping.registered[view]:
+        return FocalSource.REFINED
+    return FocalSource.HINT if np.isfinite(plan.focal_hints[plan.lens_of[view]]) else FocalSource.ASSUMED
+
+
+def _view_warnings(
+    mapping: Mapping, view: int, ratio: float, shift: tuple[float, float], *, shared: bool, plan: LensPlan
+) -> tuple[str, ...]:
+    """What is odd about a view that the model adjusted."""
+    if not mapping.registered[view] or plan.generated[view]:
+        return ()
+    said = []
+    main_ratio = float(mapping.intrinsics[plan.main, 0, 0] / mapping.shift_unit_px[plan.main, 0])
+    if not shared and plan.lens_of[view] == plan.main:
+        said.append(
+            f"its focal length is {ratio / main_ratio:.2f} times that of the others, as far as the pictures tell"
+        )
+    if max(abs(shift[0]), abs(shift[1])) > _WORTH_SAYING:
+        said.append(
+            f"it was cropped: the optical axis lies {shift[0]:+.0%}, {shift[1]:+.0%} of the long side off the centre"
+        )
+    hint = float(plan.focal_hints[plan.lens_of[view]])
+    if np.isfinite(hint) and abs(np.log(ratio / hint)) > _HINT_REJECTED:
+        said.append(
+            f"its file says a focal length of {_in_mm(hint):.0f} mm (35 mm equivalent), the pictures say {_in_mm(ratio):.0f} mm:"
+            " the pictures are believed"
+        )
+    return tuple(said)
+
+
+def _in_mm(ratio: float) -> float:
+    """35 mm equivalent of a focal over the long side, for pictures of 4:3 (the equivalent is by the diagonal)."""
+    return ratio * float(np.hypot(36.0, 24.0)) / 1.25
 
 
 def _notes(mapping: Mapping, source: FocalSource) -> tuple[str, ...]:

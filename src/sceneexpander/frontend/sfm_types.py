@@ -99,6 +99,18 @@ class SfmConfig:
     loose_px: float = 8.0  # last-chance registration (views that match only roughly, such as generated ones)
     min_loose_inliers: int = 10
     bundle_iterations: int = 40
+
+    # Evidence that a camera must have.
+    min_agreeing: float = 0.5  # share of a view's verified matches that agree with the model
+    max_rotation_gap_deg: float = (
+        8.0  # between the model's relative rotations and those of single pairs (median over pairs)
+    )
+    max_direction_deg: float = (
+        6.0  # predicted error of directions (standard deviation, median): beyond it a camera is rough
+    )
+    max_own_direction_deg: float = (
+        1.0  # the same for a view whose focal only the pictures tell: beyond it it is left out
+    )
     refine_known_poses: bool = False  # True: given poses are a start, not the truth
     refine_known_intrinsics: bool = False  # True: a shared factor on the given focals is refined
 
@@ -159,6 +171,14 @@ class ViewReport:
     inliers: int  # observations of triangulated points
     mean_error_px: float  # mean reprojection error of those, in pixels of the given images; NaN without any
     placed_like: int | None  # the view whose pose an unregistered view borrows
+    focal_ratio: float  # focal over the long side of the original
+    focal_source: FocalSource
+    distortion: tuple[float, float]  # k1, k2 that were taken out
+    centre_shift: tuple[float, float]  # of the principal point from the original's centre, over its long side
+    warnings: tuple[str, ...]  # what a person should know of a view that is used
+    agreeing: float  # see `evidence.ViewEvidence`; NaN where it could not be asked
+    rotation_gap_deg: float
+    direction_sigma_deg: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

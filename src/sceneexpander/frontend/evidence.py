@@ -1,0 +1,162 @@
+"""What speaks for each camera of a finished model, and what can fail.
+
+Bundle adjustment makes matches and cameras agree with each other, right or wrong. What is asked here is answered by something it did not
+adjust to: matches as they were found before any camera was known, motions of single pairs, how far the directions between cameras could
+move without anything being seen of it. A view that fails is taken out and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from sceneexpander.frontend.bundle import LOG_FOCAL
+from sceneexpander.frontend.epipolar import EpipolarFit, OtherView
+from sceneexpander.frontend.features import Features
+from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.sfm_types import SfmConfig
+from sceneexpander.frontend.twoview import PairMatches, relative_pose
+
+_AGREE_PX = 3.0  # at 768 px: a match this near its epipolar lines agrees with the cameras
+_MIN_MATCHES = 30  # fewer say nothing about a camera
+_NOISE_PX = 0.5  # at 768 px: systematic errors of keypoints that the scatter of their errors does not show
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewEvidence:
+    """What speaks for a view's camera. NaN where it could not be asked.
+
+    Attributes:
+        agreeing: share of its matches, as verified before any camera was known, that lie on the epipolar lines of the model.
+        rotation_gap_deg: median over the other views of the angle between the model's relative rotation and that of the pair alone.
+        direction_sigma_deg: median over the other views of how far the direction to them may be off (one standard deviation).
+        own_focal: its lens is its own and only the pictures say what its focal is.
+    """
+
+    agreeing: float
+    rotation_gap_deg: float
+    direction_sigma_deg: float
+    own_focal: bool
+
+    def refusal(self, config: SfmConfig) -> str:
+        """Why the camera cannot be believed; empty if it can."""
+        if self.agreeing < config.min_agreeing:
+            return f"only {self.agreeing:.0%} of its matches with other photos agree with any camera"
+        if self.rotation_gap_deg > config.max_rotation_gap_deg:
+            return f"its turns against other photos contradict each other by {self.rotation_gap_deg:.0f} degrees"
+        if self.own_focal and self.direction_sigma_deg > config.max_own_direction_deg:
+            return (
+                "it was taken with another focal length (zoomed or cropped), and what it shows is too flat to tell which:"
+                f" its position may be off by {2 * self.direction_sigma_deg:.0f} degrees"
+            )
+        return ""
+
+    def doubt(self, config: SfmConfig) -> str:
+        """Why the camera is only roughly right; empty if there is no such reason."""
+        if self.direction_sigma_deg > config.max_direction_deg:
+            return (
+                "the photos were taken from nearly one place: directions between cameras may be off by"
+                f" {min(2 * self.direction_sigma_deg, 180):.0f} degrees"
+            )
+        return ""
+
+
+def weigh_evidence(
+    mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches], hinted: Sequence[bool]
+) -> dict[int, ViewEvidence]:
+    """The evidence for each registered view.
+
+    Args:
+        mapping: finished model.
+        features: of all views, straightened.
+        pairs: as verified before any camera was known.
+        hinted: per view whether its file says a focal.
+    """
+    views = np.flatnonzero(mapping.registered)
+    sigma = _direction_sigma_deg(mapping)
+    gaps = _rotation_gaps_deg(mapping, features, pairs)
+    found: dict[int, ViewEvidence] = {}
+    for view in views.tolist():
+        row = sigma[view, views][np.isfinite(sigma[view, views])]
+        turned = gaps[view, views][np.isfinite(gaps[view, views])]
+        found[view] = ViewEvidence(
+            agreeing=_agreeing_share(mapping, view, features, pairs),
+            rotation_gap_deg=float(np.median(turned)) if len(turned) >= 2 else float("nan"),
+            direction_sigma_deg=float(np.median(row)) if len(row) else float("nan"),
+            own_focal=_focal_is_own(mapping, view) and not hinted[view],
+        )
+    return found
+
+
+def other_views(
+    mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]
+) -> list[OtherView]:
+    """The other registered views with their verified matches with this one."""
+    found = []
+    for pair in pairs:
+        if view not in (pair.view_a, pair.view_b) or pair.verified.count == 0:
+            continue
+        first = pair.view_a == view
+        other = pair.view_b if first else pair.view_a
+        mine, theirs = (pair.verified.index_a, pair.verified.index_b)[:: 1 if first else -1]
+        if mapping.registered[other]:
+            found.append(
+                OtherView(
+                    rotation=mapping.rotations[other],
+                    translation=mapping.translations[other],
+                    intrinsics=mapping.intrinsics[other],
+                    own_xy=features[other].pixel_xy[theirs],
+                    view_xy=features[view].pixel_xy[mine],
+                )
+            )
+    return found
+
+
+def _agreeing_share(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
+    others = other_views(mapping, view, features, pairs)
+    if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
+        return float("nan")
+    fit = EpipolarFit(others, mapping.intrinsics[view], np.ones(2), noise_px=1.0)
+    errors = fit.errors_px(mapping.rotations[view], mapping.translations[view], np.zeros(5))
+    return float((np.abs(errors) < _AGREE_PX * mapping.unit_px).mean())
+
+
+def _direction_sigma_deg(mapping: Mapping) -> Float[np.ndarray, "view view"]:
+    return mapping.direction_sigma_deg(least_noise_px=_NOISE_PX)
+
+
+def _rotation_gaps_deg(
+    mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches]
+) -> Float[np.ndarray, "view view"]:
+    """Angle between the model's relative rotation of two views and that of their essential matrix; NaN where there is none."""
+    config, views = mapping.config, len(mapping.registered)
+    intrinsics = mapping.intrinsics
+    gaps = np.full((views, views), np.nan)
+    for pair in pairs:
+        a, b = pair.view_a, pair.view_b
+        if not (mapping.registered[a] and mapping.registered[b]) or pair.verified.count < 2 * _MIN_MATCHES:
+            continue
+        pose = relative_pose(
+            features[a].pixel_xy[pair.verified.index_a],
+            features[b].pixel_xy[pair.verified.index_b],
+            intrinsics[a],
+            intrinsics[b],
+            threshold_px=config.epipolar_px * mapping.unit_px,
+            seed=mapping.seed,
+        )
+        if pose is None or pose.inlier.sum() < _MIN_MATCHES:
+            continue
+        model = mapping.rotations[b] @ mapping.rotations[a].T
+        cosine = (np.trace(pose.rotation @ model.T) - 1) / 2
+        gaps[a, b] = gaps[b, a] = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return gaps
+
+
+def _focal_is_own(mapping: Mapping, view: int) -> bool:
+    """No other registered view shares the focal, which nothing but the pictures holds."""
+    holder = mapping.lenses.focal_of[mapping.lens_of]
+    alone = int((holder[mapping.registered] == holder[view]).sum()) == 1
+    return alone and mapping.registered.sum() > 1 and bool(mapping.lenses.free[holder[view], LOG_FOCAL])
