@@ -66,7 +66,8 @@ def gate(allowed: Sequence[str]) -> Iterator[None]:
     """
     from websockets.asyncio import server as library
 
-    real, caught = library.serve, list[bool]()
+    module: Any = library
+    real, caught = module.serve, list[bool]()
 
     def guarded(*args: Any, process_request: Any = None, **kwargs: Any) -> Any:
         def ask(connection: Any, request: Any) -> Any:
@@ -80,11 +81,11 @@ def gate(allowed: Sequence[str]) -> Iterator[None]:
         caught.append(True)
         return real(*args, process_request=ask, **kwargs)
 
-    library.serve = guarded
+    module.serve = guarded
     try:
         yield
     finally:
-        library.serve = real
+        module.serve = real
     if not caught:
         raise RuntimeError(
             "this version of viser starts its server in another way: foreign pages could reach the viewer"
