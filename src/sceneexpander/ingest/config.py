@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from sceneexpander.errors import UserError
+from sceneexpander.ranges import Range, check_ranges
 
 Fit = Literal["crop", "pad"]
 FITS: tuple[Fit, ...] = ("crop", "pad")
@@ -26,18 +27,16 @@ class IngestConfig:
         allow_single_view: accept a scene of one photo.
     """
 
-    long_side_px: int = 336
-    detail_scale: int = 2
+    long_side_px: Annotated[int, Range(1, 4096)] = 336
+    detail_scale: Annotated[int, Range(1, 8)] = 2
     fit: Fit = "crop"
-    multiple: int = 14
-    max_views: int = 30
-    max_megapixels: float = 200.0
+    multiple: Annotated[int, Range(1, 256)] = 14
+    max_views: Annotated[int, Range(1, 1000)] = 30
+    max_megapixels: Annotated[float, Range(0, 1000, low_open=True)] = 200.0
     allow_single_view: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("long_side_px", "detail_scale", "multiple", "max_views", "max_megapixels"):
-            if getattr(self, name) <= 0:
-                raise UserError(f"must be positive, is {getattr(self, name)}", where=f"ingest.{name}")
+        check_ranges(self)
         if self.long_side_px % self.multiple:
             lower = max(1, self.long_side_px // self.multiple) * self.multiple
             raise UserError(
