@@ -49,12 +49,13 @@ Steps = Annotated[int, Range(0, MAX_STEPS)]
 
 def check_ranges(config: object) -> None:
     """Raise `UserError` naming the first field of a dataclass whose number lies outside its declared range."""
-    for name, hint in _ranged_fields(type(config)):
+    schema: Any = type(config)
+    for name, hint in _ranged_fields(schema):
         _check(hint, getattr(config, name), name)
 
 
 @functools.cache
-def _ranged_fields(schema: type) -> tuple[tuple[str, Any], ...]:
+def _ranged_fields(schema: Any) -> tuple[tuple[str, Any], ...]:
     hints = typing.get_type_hints(schema, include_extras=True)
     names = [f.name for f in dataclasses.fields(schema)]
     return tuple((name, hints[name]) for name in names if any(True for _ in number_ranges(hints[name])))

@@ -20,6 +20,8 @@ from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.ranges import shown_number
 
 T = TypeVar("T")
+# What a dataclass raises for values that do not go together.
+REFUSALS = (ValueError, TypeError, ArithmeticError, LookupError, AttributeError, RuntimeError)
 MISSING = "???"  # how a configuration says that a value must be given
 _SHOWN_CHARACTERS = 60
 _LARGEST_FLOAT = 10**308
@@ -29,7 +31,9 @@ class DecodeError(UserError):
     """A value has another type than its place, or is missing. ``where`` is the dotted key."""
 
 
-def decode_dataclass(schema: type[T], raw: object, *, where: str = "", complete: bool = False) -> T:
+def decode_dataclass(
+    schema: type[T], raw: object, *, where: str = "", complete: bool = False, extra: bool = False
+) -> T:
     """Build ``schema`` from a mapping whose keys are its fields.
 
     Args:
@@ -37,15 +41,17 @@ def decode_dataclass(schema: type[T], raw: object, *, where: str = "", complete:
         raw: a mapping of plain values.
         where: dotted key of ``raw`` inside the whole, for messages.
         complete: fields with a default must be present too, and ``???`` stands for a value that is still to be given.
+        extra: pass over keys of the outermost mapping that are no fields: the file is somebody else's.
 
     Raises:
         DecodeError: one line that names the offending key.
     """
     if not isinstance(raw, Mapping):
         raise DecodeError(f"is {describe(raw)}, expected a section with keys", where=_key(where))
-    hints, required = _fields(schema)
+    hashable: Any = schema
+    hints, required = fields_of(hashable)
     for key in raw:
-        if key not in hints:
+        if key not in hints and not extra:
             name = shorten(str(key)) if isinstance(key, str) else describe(key)
             raise DecodeError("unknown key", where=_key(where, name), fix=did_you_mean(name, hints))
     values: dict[str, Any] = {}
@@ -61,12 +67,12 @@ def decode_dataclass(schema: type[T], raw: object, *, where: str = "", complete:
         last = (error.where or "").rpartition(".")[2]
         own = last if last.partition("[")[0] in hints else ""
         raise DecodeError(error.problem, where=_key(where, own), fix=error.fix) from None
-    except (ValueError, TypeError, ArithmeticError, LookupError) as error:
+    except REFUSALS as error:
         raise DecodeError(shorten(str(error), 300), where=_key(where)) from None
 
 
 @functools.cache
-def _fields(schema: type) -> tuple[dict[str, Any], frozenset[str]]:
+def fields_of(schema: Any) -> tuple[dict[str, Any], frozenset[str]]:
     """(annotated type by name, names without a default) of a dataclass's arguments."""
     hints = typing.get_type_hints(schema, include_extras=True)
     arguments = [f for f in dataclasses.fields(schema) if f.init]

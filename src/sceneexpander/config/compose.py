@@ -123,8 +123,8 @@ def check_override(conf: Path, text: str) -> bool:
 def _is_optional(conf: Path, group: str) -> bool:
     from omegaconf import OmegaConf
 
-    defaults = OmegaConf.load(conf / f"{_ROOT}.yaml").get("defaults", [])
-    return any(not isinstance(entry, str) and f"optional {group}" in entry for entry in defaults)
+    content: Any = OmegaConf.load(conf / f"{_ROOT}.yaml")
+    return any(not isinstance(entry, str) and f"optional {group}" in entry for entry in content.defaults)
 
 
 @contextmanager
