@@ -50,7 +50,7 @@ def check_scene(
     count = len(scene.rounds) if rounds is None else rounds
     records = [*scene.views.records]
     for number in range(1, count + 1):
-        inserted = generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
+        inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
         records += inserted.view.records
     check_truth(folder, records)
     check_weights(config.model)
