@@ -18,7 +18,7 @@ import shutil
 import types
 import typing
 import uuid
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -177,6 +177,8 @@ def refusing(folder: Path) -> Iterator[None]:
     """Turn what a dataclass says about values that do not go together into an `ArtifactError` about the folder they came from."""
     try:
         yield
+    except DecodeError as error:
+        raise ArtifactError(f"is invalid ({error.where}: {error.problem})", where=folder, fix=RERUN) from None
     except UserError:
         raise
     except REFUSALS as error:
@@ -260,20 +262,30 @@ def load_artifact(folder: Path, schema: str) -> tuple[dict[str, Any], dict[str, 
         ) from None
 
 
-def load_resume_point(folder: Path, schema: str, run_key: str) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
-    """(facts, tensors) of an artefact whose fact ``run_key`` is the given one, or None; what else lies there is reported and ignored."""
+def load_resume_point(
+    folder: Path, schema: str, run_key: str, build: Callable[[dict[str, Any], dict[str, Tensor]], T]
+) -> T | None:
+    """What ``build`` makes of an artefact whose fact ``run_key`` is the given one, or None; what else lies there is reported and ignored.
+
+    Args:
+        folder: of the artefact.
+        schema: of the artefact.
+        run_key: of the run that is to go on.
+        build: from facts and tensors; whatever it says about values that are none makes the artefact a damaged one.
+    """
     _tidy(folder)
     if not folder.exists():
         return None
     try:
         facts, tensors = load_artifact(folder, schema)
+        if facts.get("run_key") != run_key:
+            _log.warning("ignoring a checkpoint of another run in %s", folder)
+            return None
+        with refusing(folder):
+            return build(facts, tensors)
     except ArtifactError as error:
         _log.warning("ignoring a damaged checkpoint: %s", error.line())
         return None
-    if facts.get("run_key") != run_key:
-        _log.warning("ignoring a checkpoint of another run in %s", folder)
-        return None
-    return facts, tensors
 
 
 def require_tensor(tensors: Mapping[str, Tensor], name: str, folder: Path) -> Tensor:

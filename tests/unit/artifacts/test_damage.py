@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
+from sceneexpander.adaptation.checkpoint import Checkpoint as AdaptationCheckpoint
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
@@ -29,6 +30,7 @@ from sceneexpander.artifacts.store import FACTS_NAME, TENSORS_NAME, ArtifactErro
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.artifacts.views import LensFacts, ViewSet
 from sceneexpander.geometry.priors import Priors
+from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
 from sceneexpander.viewer.packed import PackedSplats, pack_splats
 from tests.unit.artifacts.test_artifacts import make_reconstruction, make_views
 from tests.unit.evaluation.made import made_reconstruction
@@ -284,3 +286,35 @@ def test_a_path_that_is_no_path_is_one_line() -> None:
     for path in (Path("a\0b"), Path("x" * 5000), Path("/dev/null/x"), Path("/dev/zero")):
         with pytest.raises(ArtifactError):
             read_json(path)
+
+
+RESUME: dict[str, Any] = {
+    "adaptation": AdaptationCheckpoint(
+        run_key="k", step=3, buckets=[(("w",), {"theta": torch.ones(2)})], records=[{"loss": 1.0}], looks=[]
+    ),
+    "optimisation": OptimisationCheckpoint(
+        run_key="k", step=3, losses=[1.0], splats={"means": torch.ones(2)}, density={}, cameras={}
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(RESUME))
+def test_a_damaged_resume_point_is_reported_and_ignored(
+    kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    checkpoint, folder = RESUME[kind], tmp_path / "resume"
+    load = type(checkpoint).load
+    checkpoint.save(folder)
+    assert load(folder, "k").step == 3
+    assert load(folder, "another") is None
+    path = folder / FACTS_NAME
+    facts = json.loads(path.read_text())
+    for key in facts.keys() - {"schema", "run_key"}:
+        for changed in ({k: v for k, v in facts.items() if k != key}, {**facts, key: "x"}, {**facts, key: [[3]]}):
+            caplog.clear()
+            path.write_text(json.dumps(changed))
+            assert load(folder, "k") is None
+            assert "ignoring a damaged checkpoint" in caplog.text
+    path.write_text(json.dumps(facts))
+    save_file({"9/theta": torch.ones(2), "x": torch.ones(1)}, str(folder / TENSORS_NAME))
+    assert load(folder, "k") is None
