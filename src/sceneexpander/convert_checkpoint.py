@@ -11,24 +11,34 @@ second closed list has their names; all of them stand for an object that holds n
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import math
 import os
 import pickle
+import struct
 import sys
 import uuid
 import zipfile
+import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
 from sceneexpander.errors import UserError, entry_point
+from sceneexpander.typed import REFUSALS, describe, shorten
 
+MAX_DIMENSIONS = 64  # of a tensor, as in PyTorch
+MAX_GROWTH, SMALL_BYTES = (
+    4,
+    16 << 20,
+)  # tensors that share a storage are written apart: at most so many times the checkpoint's size
 MAX_PICKLE_BYTES = 64 << 20  # names and shapes only; the numbers live outside the pickle
 STORAGE_DTYPES = {
     "FloatStorage": torch.float32,
@@ -44,6 +54,7 @@ STORAGE_DTYPES = {
 }
 STATE_DICT_KEYS = ("state_dict", "model_state_dict", "model")  # where training scripts put the weights
 WRAPPER = "module."
+LITTLE = b"little"
 
 
 class RefusedPickleError(Exception):
@@ -80,6 +91,11 @@ class _View(_Sealed):
 
 class _Entries(OrderedDict[object, object]):
     """The ordered dictionary of a state dict; module metadata that hangs on it is dropped."""
+
+    def __init__(self, *arguments: object) -> None:
+        super().__init__()
+        if arguments and arguments != ((),) and arguments != ([],):
+            raise RefusedPickleError("an ordered dictionary is not filled entry by entry")
 
     def __setstate__(self, state: object) -> None:
         return
@@ -119,6 +135,7 @@ class _Archive:
     def __init__(self, archive: zipfile.ZipFile, prefix: str) -> None:
         self.archive = archive
         self.prefix = prefix
+        self.left = sum(entry.file_size for entry in archive.infolist() if entry.compress_type == zipfile.ZIP_STORED)
         self.storages: dict[str, _Storage] = {}
 
     def storage(self, dtype: torch.dtype, key: str, count: int) -> _Storage:
@@ -135,6 +152,10 @@ class _Archive:
             raise RefusedPickleError(
                 f"storage {key!r} has {entry.file_size} bytes, expected {count * item} uncompressed"
             )
+        # Two entries of an archive may lie on the same bytes, but not more of them than the file has.
+        self.left -= entry.file_size
+        if self.left < 0:
+            raise RefusedPickleError("its storages overlap")
         raw = bytearray(self.archive.read(entry))
         values = torch.frombuffer(raw, dtype=dtype) if count else torch.empty(0, dtype=dtype)
         self.storages[key] = _Storage(values)
@@ -145,13 +166,15 @@ def _rebuild_tensor(storage: object, offset: object, size: object, stride: objec
     """A view of a storage; gradient flags and hooks are ignored."""
     if not isinstance(storage, _Storage) or not isinstance(size, tuple) or not isinstance(stride, tuple):
         raise RefusedPickleError("a tensor is not built from a storage")
+    # Nothing of the pickle is written out before it is known to be numbers: a tuple can hold itself many times over.
     numbers = (offset, *size, *stride)
     if (
-        not isinstance(offset, int)
-        or len(size) != len(stride)
-        or not all(isinstance(n, int) and n >= 0 for n in numbers)
+        len(size) != len(stride)
+        or len(size) > MAX_DIMENSIONS
+        or not all(type(n) is int and 0 <= n < 1 << 62 for n in numbers)
     ):
-        raise RefusedPickleError(f"a tensor has offset {offset}, size {size} and stride {stride}")
+        raise RefusedPickleError("a tensor has an offset, size or stride that is none")
+    assert isinstance(offset, int)  # noqa: S101 - checked with the others
     available, count = storage.values.numel(), math.prod(size)
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     # The count too: with strides of 0 a small file could claim any amount of memory once copied.
@@ -194,12 +217,44 @@ ALLOWED: dict[tuple[str, str], object] = {
 }
 
 
-class _Unpickler(pickle.Unpickler):
-    """Looks names up in `ALLOWED` and nowhere else: no module is ever imported for a pickle."""
+# The unpickler written in Python: the other one does not let anyone look at a key before it is hashed, which never ends for a tuple that
+# holds another one twice, and that one another one twice, ... Its type is not declared.
+_PurePython: Any = pickle._Unpickler  # type: ignore[attr-defined,unused-ignore]
+
+
+class _Unpickler(_PurePython):  # type: ignore[misc]
+    """Looks names up in `ALLOWED` and nowhere else: no module is ever imported for a pickle. Keys are texts or numbers."""
+
+    dispatch: ClassVar[dict[int, Any]] = dict(_PurePython.dispatch)
 
     def __init__(self, data: bytes, archive: _Archive) -> None:
         super().__init__(io.BytesIO(data))
         self.archive = archive
+
+    def load_setitem(self) -> None:
+        self._check_keys(self.stack[-2:-1])
+        _PurePython.load_setitem(self)
+
+    def load_setitems(self) -> None:
+        self._check_keys(self.stack[::2])
+        _PurePython.load_setitems(self)
+
+    def load_dict(self) -> None:
+        self._check_keys(self.stack[::2])
+        _PurePython.load_dict(self)
+
+    def refuse_set(self) -> None:
+        raise RefusedPickleError("it holds a set")
+
+    def _check_keys(self, keys: Sequence[object]) -> None:
+        if not all(isinstance(key, (str, int)) for key in keys):
+            raise RefusedPickleError("a dictionary has a key that is no text")
+
+    dispatch[pickle.SETITEM[0]] = load_setitem
+    dispatch[pickle.SETITEMS[0]] = load_setitems
+    dispatch[pickle.DICT[0]] = load_dict
+    for _opcode in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET):
+        dispatch[_opcode[0]] = refuse_set
 
     def find_class(self, module: str, name: str) -> Any:
         try:
@@ -225,8 +280,11 @@ def read_checkpoint(path: Path, *, key: str | None = None) -> dict[str, Tensor]:
     Raises:
         UserError: not a zip-format checkpoint, truncated, or a pickle that asks for anything but plain tensors.
     """
-    if not path.is_file():
-        raise UserError("does not exist" if not path.exists() else "is not a file", where=path, fix="check the path")
+    if not os.path.isfile(path):
+        there = os.path.exists(path)
+        raise UserError(
+            "is not a file" if there else "does not exist", where=shorten(str(path), 300), fix="check the path"
+        )
     try:
         with zipfile.ZipFile(path) as archive:
             content = _unpickle(archive)
@@ -236,12 +294,30 @@ def read_checkpoint(path: Path, *, key: str | None = None) -> dict[str, Tensor]:
     except RefusedPickleError as error:
         fix = "only checkpoints of plain tensors are converted; ask its author for safetensors"
         raise UserError(f"is refused: {error}", where=path, fix=fix) from None
-    except (pickle.UnpicklingError, EOFError, OSError, MemoryError, RuntimeError, NotImplementedError) as error:
-        raise UserError(f"is damaged ({error or type(error).__name__})", where=path, fix="fetch it again") from None
-    except (ValueError, TypeError, AttributeError, IndexError, KeyError, OverflowError) as error:
-        # What a hand-made pickle provokes inside the unpickler; the list above is what a broken file does.
-        raise UserError(f"holds a malformed pickle ({type(error).__name__}: {error})", where=path) from None
-    return _weights_of(content, path, key)
+    except (pickle.UnpicklingError, EOFError, OSError, MemoryError, RuntimeError, struct.error, zlib.error) as error:
+        reason = shorten(str(error) or type(error).__name__, 200)
+        raise UserError(f"is damaged ({reason})", where=path, fix="fetch it again") from None
+    except (*REFUSALS, AssertionError) as error:
+        # What a hand-made pickle provokes inside the unpickler; the list above is what a broken file does. The text of such an error
+        # may be that of an object of the pickle, and endless.
+        raise UserError(f"holds a malformed pickle ({type(error).__name__})", where=path) from None
+    tensors = _weights_of(content, path, key)
+    _check_growth(tensors, path)
+    return tensors
+
+
+def _check_growth(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Refuse names that are none, and few bytes under so many names that writing them out would fill a disk."""
+    for name in tensors:
+        if name == "__metadata__" or any("\ud800" <= letter <= "\udfff" for letter in name):
+            raise UserError(f"has a tensor named {shorten(name)!a}, which safetensors cannot hold", where=path)
+    total, size = sum(tensor.nbytes for tensor in tensors.values()), path.stat().st_size
+    if total > max(SMALL_BYTES, MAX_GROWTH * size):
+        raise UserError(
+            f"holds {size} bytes under so many names that they would become {total}",
+            where=path,
+            fix="name a part with --key",
+        )
 
 
 def _unpickle(archive: zipfile.ZipFile) -> object:
@@ -249,10 +325,17 @@ def _unpickle(archive: zipfile.ZipFile) -> object:
     if len(names) != 1:
         raise RefusedPickleError(f"it has {len(names)} data.pkl entries, expected 1")
     prefix = names[0].removesuffix("data.pkl")
-    if f"{prefix}byteorder" in archive.namelist() and archive.read(f"{prefix}byteorder") != b"little":
+    order = f"{prefix}byteorder"
+    # Its size first: a compressed entry of a few bytes may hold gigabytes.
+    if order in archive.namelist() and (
+        archive.getinfo(order).file_size != len(LITTLE) or archive.read(order) != LITTLE
+    ):
         raise RefusedPickleError("its numbers are not little-endian")
-    if archive.getinfo(names[0]).file_size > MAX_PICKLE_BYTES:
+    entry = archive.getinfo(names[0])
+    if entry.file_size > MAX_PICKLE_BYTES:
         raise RefusedPickleError(f"its pickle is larger than {MAX_PICKLE_BYTES} bytes")
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise RefusedPickleError("its pickle is compressed in a way that PyTorch does not use")
     return _Unpickler(archive.read(names[0]), _Archive(archive, prefix)).load()
 
 
@@ -267,9 +350,9 @@ def _weights_of(content: object, path: Path, key: str | None) -> dict[str, Tenso
                 }
                 if tensors:
                     return _without_wrapper(tensors)
-        there = ", ".join(str(name) for name in list(content)[:5])
+        there = ", ".join(shorten(name) if isinstance(name, str) else describe(name) for name in list(content)[:5])
         raise UserError(f"has no dictionary of tensors (its entries: {there})", where=path, fix="name it with --key")
-    raise UserError(f"holds a {type(content).__name__}, not a dictionary of tensors", where=path)
+    raise UserError(f"holds a {type(content).__name__.strip('_').lower()}, not a dictionary of tensors", where=path)
 
 
 def _without_wrapper(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -283,24 +366,40 @@ def convert(source: Path, target: Path, *, key: str | None = None) -> int:
     """Write the checkpoint's tensors as safetensors, atomically; returns how many.
 
     Raises:
-        UserError: see `read_checkpoint`, or if the target has another suffix.
+        UserError: see `read_checkpoint`, or if the target has another suffix or cannot be written.
     """
     if target.suffix != ".safetensors":
-        raise UserError("must end in .safetensors", where=target, fix="choose another output name")
+        raise UserError("must end in .safetensors", where=shorten(str(target), 300), fix="choose another output name")
+    if os.path.isdir(target):
+        raise UserError("is a folder", where=target, fix="choose another output name")
+    # Before the checkpoint is read, which may take minutes: can a file have this name?
+    with _writing(target), contextlib.suppress(FileNotFoundError):
+        target.lstat()
     tensors = read_checkpoint(source, key=key)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
-    try:
-        # Clones: safetensors refuses tensors that share memory.
-        save_file(
-            {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}, scratch
-        )
-        with scratch.open("rb") as file:
-            os.fsync(file.fileno())
-        scratch.replace(target)
-    finally:
-        scratch.unlink(missing_ok=True)
+    scratch = target.parent / f".{uuid.uuid4().hex}.part"
+    with _writing(target):
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            # Clones: safetensors refuses tensors that share memory.
+            whole = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
+            save_file(whole, scratch)
+            with scratch.open("rb") as file:
+                os.fsync(file.fileno())
+            scratch.replace(target)
+        finally:
+            with contextlib.suppress(OSError):
+                scratch.unlink()
     return len(tensors)
+
+
+@contextlib.contextmanager
+def _writing(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError, SafetensorError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        problem = f"cannot be written ({shorten(reason, 200)})"
+        raise UserError(problem, where=shorten(str(target), 300), fix="choose another output name") from None
 
 
 @entry_point

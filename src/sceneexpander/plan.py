@@ -1,8 +1,8 @@
 """``python -m sceneexpander.plan KEY=VALUE...``: memory and operations of an adaptation, without a GPU and without weights.
 
     model=worldmirror/large   or worldmirror/mid, worldmirror/tiny, mini
-    views=9                   all views, the inserted one included
-    width=518 height=518      pixels; the height is the width unless given
+    views=9                   all views, the inserted one included; at most 64
+    width=518 height=518      pixels, at most 4096; the height is the width unless given
     options=gpu24             a profile of conf/profile (gpu24 is made for 24 GB), or `paper`: the plain way to run the method
     tflops=60                 what the device really reaches; gives times
     adapt.KEY=VALUE           any key of conf/adapt
@@ -27,10 +27,15 @@ from sceneexpander.errors import UserError, did_you_mean, entry_point
 from sceneexpander.planning import PlanRequest, adaptation_cost, inference_cost
 from sceneexpander.planning.models import planned_model
 from sceneexpander.project import find_project
+from sceneexpander.typed import shorten
 
 KEYS = ("model", "views", "width", "height", "options", "tflops")
 FLAGS = ("--json", "--help")
 PAPER = "paper"
+MAX_VIEWS = 64  # a plan takes about a second of one core for each
+MAX_SIDE = 4096
+MAX_TFLOPS = 1_000_000
+MAX_DIGITS = 10
 GIGA = 1e9
 
 
@@ -57,29 +62,30 @@ def parse(arguments: Sequence[str]) -> Question:
     for argument in arguments:
         key, equals, value = argument.partition("=")
         if not equals or not value:
-            raise UserError("is not KEY=VALUE", where=argument, fix=f"keys: {', '.join(KEYS)}, adapt.*")
+            raise UserError("is not KEY=VALUE", where=shorten(argument), fix=f"keys: {', '.join(KEYS)}, adapt.*")
         if key.startswith("adapt."):
             overrides.append(argument)
         elif key not in KEYS:
-            raise UserError("unknown key", where=argument, fix=did_you_mean(key, [*KEYS, "adapt.*"]))
+            raise UserError("unknown key", where=shorten(argument), fix=did_you_mean(shorten(key), [*KEYS, "adapt.*"]))
         else:
             given[key] = value
-    width = _whole(given, "width", DEFAULT.width)
+    width = _whole(given, "width", DEFAULT.width, least=1, most=MAX_SIDE)
     return Question(
         model=given.get("model", DEFAULT.model),
-        views=_whole(given, "views", DEFAULT.views, least=2),
+        views=_whole(given, "views", DEFAULT.views, least=2, most=MAX_VIEWS),
         width=width,
-        height=_whole(given, "height", width),
+        height=_whole(given, "height", width, least=1, most=MAX_SIDE),
         options=given.get("options", DEFAULT.options),
         tflops=_positive(given, "tflops"),
         overrides=tuple(overrides),
     )
 
 
-def _whole(given: Mapping[str, str], key: str, default: int, *, least: int = 1) -> int:
+def _whole(given: Mapping[str, str], key: str, default: int, *, least: int, most: int) -> int:
     text = given.get(key, str(default))
-    if not text.isdecimal() or int(text) < least:
-        raise UserError(f"is {text!r}", where=key, fix=f"give a whole number from {least} on")
+    # Its length first: Python refuses to read numbers of thousands of digits.
+    if not (text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS and least <= int(text) <= most):
+        raise UserError(f"is {shorten(text)!r}", where=key, fix=f"give a whole number from {least} to {most}")
     return int(text)
 
 
@@ -90,8 +96,8 @@ def _positive(given: Mapping[str, str], key: str) -> float | None:
         value = float(given[key])
     except ValueError:
         value = 0.0
-    if not 0 < value < float("inf"):
-        raise UserError(f"is {given[key]!r}", where=key, fix="give a number above 0")
+    if not 0 < value <= MAX_TFLOPS:
+        raise UserError(f"is {shorten(given[key])!r}", where=key, fix=f"give a number above 0 and at most {MAX_TFLOPS}")
     return value
 
 
@@ -109,7 +115,9 @@ def request_of(question: Question) -> PlanRequest:
     profiles = sorted(path.stem for path in (conf / "profile").glob("*.yaml"))
     if question.options not in (*profiles, PAPER):
         raise UserError(
-            "unknown", where=f"options={question.options}", fix=did_you_mean(question.options, [*profiles, PAPER])
+            "unknown",
+            where=f"options={shorten(question.options)}",
+            fix=did_you_mean(shorten(question.options), [*profiles, PAPER]),
         )
     profile = "gpu" if question.options == PAPER else question.options
     values = compose(conf, [f"profile={profile}", *question.overrides])

@@ -11,11 +11,12 @@ from sceneexpander.config.compose import compose, scene_option
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
-from sceneexpander.evaluation.truth import load_truth
+from sceneexpander.evaluation import check_truth
 from sceneexpander.expansion import ModelConfig, load_model
 from sceneexpander.generation import generate_inserted_view
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
+from sceneexpander.models.weights import HUB_ID
 
 
 def check_scene(
@@ -46,10 +47,12 @@ def check_scene(
     config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
     check_device(config.device)
     scene = load_scene(folder, config.scene)
-    load_truth(folder)  # read by the last stages only, so a mistake in it would cost the whole run
     count = len(scene.rounds) if rounds is None else rounds
+    records = [*scene.views.records]
     for number in range(1, count + 1):
-        generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
+        inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
+        records += inserted.view.records
+    check_truth(folder, records)  # read by the last stages only, so a mistake in it would cost the whole run
     check_weights(config.model)
     for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
         section = config.rivals.of(rival)
@@ -69,16 +72,22 @@ def check_device(device: str) -> None:
     """Raise `UserError` if the device is not there."""
     import torch
 
-    if device.startswith("cuda") and not torch.cuda.is_available():
+    if not device.startswith("cuda"):
+        return
+    if not torch.cuda.is_available():
         raise UserError(f"is {device!r}, but no CUDA device is available", where="device", fix="use device=cpu")
+    count, index = torch.cuda.device_count(), int(device.partition(":")[2] or 0)
+    if index >= count:
+        names = "cuda:0 is the only one" if count == 1 else f"there are cuda:0 to cuda:{count - 1}"
+        raise UserError(f"is {device!r}, which is not there", where="device", fix=names)
 
 
 def check_weights(config: ModelConfig) -> None:
     """Load the weights once, so that a file that is missing or does not fit is refused here.
 
-    Weights on a hub are left to the stage that downloads them.
+    Weights that may be downloaded from a hub are left to the stage that does it; others must be in its local cache.
     """
-    if "@" in config.weights and not Path(config.weights).exists():
+    if config.allow_download and HUB_ID.fullmatch(config.weights):
         if importlib.util.find_spec("huggingface_hub") is None:
             raise UserError("names a hub, but huggingface-hub is not installed", where="model.weights")
         return

@@ -244,3 +244,174 @@ def test_the_command_reports_what_it_wrote(tmp_path: Path, capsys: pytest.Captur
     assert main([str(tmp_path / "in.pt"), str(tmp_path / "sub" / "out.safetensors")]) == 0
     assert "1 tensors" in capsys.readouterr().out
     assert [p.name for p in (tmp_path / "sub").iterdir()] == ["out.safetensors"]
+
+
+def dag(depth: int) -> tuple[Any, ...]:
+    """A tuple of two equal tuples, and so on: a few bytes that take for ever to hash, compare or write out."""
+    value: tuple[Any, ...] = ()
+    for _ in range(depth):
+        value = (value, value)
+    return value
+
+
+class Marker:
+    """Stands for a storage of 4 floats in what `pickled` writes."""
+
+
+def pickled(content: Any) -> bytes:
+    class Forger(pickle.Pickler):
+        def persistent_id(self, obj: Any) -> Any:
+            return ("storage", torch.FloatStorage, "0", "cpu", 4) if isinstance(obj, Marker) else None
+
+    buffer = io.BytesIO()
+    Forger(buffer, protocol=2).dump(content)
+    return buffer.getvalue()
+
+
+class Call:
+    """Pickled as the call of a function."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.call = function, arguments
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+def tensor(offset: Any = 0, size: Any = (4,), stride: Any = (1,)) -> Call:
+    return Call(torch._utils._rebuild_tensor_v2, Marker(), offset, size, stride, False, OrderedDict())
+
+
+def with_key_tuple() -> bytes:
+    # {(...): 1}, written by hand: making it here would hash it.
+    return (
+        pickle.PROTO
+        + b"\2"
+        + pickle.EMPTY_DICT
+        + pickle.dumps(dag(60), 2)[2:-1]
+        + pickle.BININT1
+        + b"\1"
+        + pickle.SETITEM
+        + pickle.STOP
+    )
+
+
+def with_set() -> bytes:
+    return (
+        pickle.PROTO
+        + b"\4"
+        + pickle.EMPTY_SET
+        + pickle.MARK
+        + pickle.dumps(dag(60), 2)[2:-1]
+        + pickle.ADDITEMS
+        + pickle.STOP
+    )
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    "data",
+    [
+        with_key_tuple(),
+        with_set(),
+        pickled({"x": tensor(size=dag(60))}),
+        pickled({"x": tensor(size=(dag(60),), stride=(1,))}),
+        pickled({"x": tensor(offset=dag(60))}),
+        pickled({"x": tensor(size=(10**5000,), stride=(1,))}),
+        pickled({"x": tensor(size=(1,) * 100, stride=(1,) * 100)}),
+        pickled({"x": tensor(size=(True,), stride=(1,))}),
+        pickled({"x": Call(OrderedDict, [(1, 2)])}),
+        pickled({"x": Call(OrderedDict, dag(60))}),
+        pickled([dag(60)]),
+        pickled({f"{'y' * 100_000}": 1}),
+        pickled({10**5000: 1}),
+    ],
+    ids=[
+        "tuple as key",
+        "set",
+        "size",
+        "in the size",
+        "offset",
+        "huge",
+        "dimensions",
+        "truth",
+        "pairs",
+        "argument",
+        "list",
+        "name",
+        "number",
+    ],
+)
+def test_a_small_pickle_that_stands_for_much_is_one_line(tmp_path: Path, data: bytes) -> None:
+    path = write_archive(tmp_path / "in.pt", data, {"0": bytes(16)})
+    with pytest.raises(UserError) as caught:
+        read_checkpoint(path)
+    assert len(caught.value.line()) < 500 + len(str(path))
+
+
+@pytest.mark.parametrize("name", ["byteorder", "data.pkl"])
+def test_an_entry_that_announces_gigabytes_is_not_read(tmp_path: Path, name: str) -> None:
+    import tracemalloc
+
+    path = tmp_path / "in.pt"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        if name != "data.pkl":
+            archive.writestr("archive/data.pkl", pickled({"x": tensor()}))
+        with archive.open(f"archive/{name}", "w") as entry:
+            for _ in range(80):
+                entry.write(bytes(1 << 20))
+    tracemalloc.start()
+    with pytest.raises(UserError, match="is refused"):
+        read_checkpoint(path)
+    assert tracemalloc.get_traced_memory()[1] < 20 << 20
+    tracemalloc.stop()
+
+
+def test_one_storage_under_many_names_is_not_written_out(tmp_path: Path) -> None:
+    values = torch.zeros(100_000)
+    torch.save({f"w{i}": values for i in range(200)}, tmp_path / "in.pt")
+    with pytest.raises(UserError, match="under so many names that they would become 80000000"):
+        convert(tmp_path / "in.pt", tmp_path / "out.safetensors")
+    # Weights that are tied, and a few averages of them, are usual.
+    torch.save({f"w{i}": values for i in range(4)}, tmp_path / "tied.pt")
+    assert convert(tmp_path / "tied.pt", tmp_path / "out.safetensors") == 4
+
+
+@pytest.mark.parametrize("name", ["\ud800", "a\udfffb", "__metadata__"])
+def test_names_that_safetensors_cannot_hold_are_refused(tmp_path: Path, name: str) -> None:
+    path = write_archive(tmp_path / "in.pt", pickled({name: tensor()}), {"0": bytes(16)})
+    with pytest.raises(UserError, match="cannot hold"):
+        convert(path, tmp_path / "out.safetensors")
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "folder.safetensors",
+        "file/out.safetensors",
+        "x" * 300 + ".safetensors",
+        "a\0b.safetensors",
+        "y" * 5000,
+        "/proc/x/out.safetensors",
+    ],
+)
+def test_a_target_that_cannot_be_written_is_one_line(tmp_path: Path, target: str) -> None:
+    torch.save({"w": torch.zeros(2)}, tmp_path / "in.pt")
+    (tmp_path / "folder.safetensors").mkdir()
+    (tmp_path / "file").write_text("x")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(UserError) as caught:
+        convert(tmp_path / "in.pt", tmp_path / target)
+    assert len(caught.value.line()) < 800
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_long_name_that_a_file_can_have_is_taken(tmp_path: Path) -> None:
+    torch.save({"w": torch.zeros(2)}, tmp_path / "in.pt")
+    assert convert(tmp_path / "in.pt", tmp_path / ("x" * 240 + ".safetensors")) == 1
+
+
+@pytest.mark.parametrize("source", ["x" * 5000, "a\0b", "x" * 300, "."])
+def test_a_source_that_is_no_file_is_one_line(tmp_path: Path, source: str) -> None:
+    with pytest.raises(UserError, match=r"does not exist|is not a file"):
+        read_checkpoint(tmp_path / source)

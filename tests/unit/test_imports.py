@@ -10,8 +10,9 @@ import pytest
 
 PACKAGE = Path(__file__).parents[2] / "src" / "sceneexpander"
 
-# What every room stands on: how user errors look, and how users' files are opened. These import nothing but each other.
-GROUND = {"errors", "plainfiles", "yamlfile"}
+# What every room stands on: how user errors look, how users' files are opened, ranges of numbers, plain values into types.
+# These import nothing but each other.
+GROUND = {"errors", "plainfiles", "ranges", "typed", "yamlfile"}
 # What each room may import besides itself and the ground floor.
 ROOMS: dict[str, set[str]] = {
     "geometry": set(),

@@ -12,7 +12,8 @@ from typing import Any
 
 from torch import Tensor
 
-from sceneexpander.artifacts.store import directory_being_written, load_resume_point, save_artifact
+from sceneexpander.artifacts.store import directory_being_written, load_fields, load_resume_point, save_artifact
+from sceneexpander.typed import decode
 
 SCHEMA = "adaptation-checkpoint/3"
 
@@ -43,19 +44,14 @@ class Checkpoint:
     @classmethod
     def load(cls, folder: Path, run_key: str) -> Checkpoint | None:
         """The checkpoint of this very run, or None if there is none (damaged ones are reported and ignored)."""
-        found = load_resume_point(folder, SCHEMA, run_key)
-        if found is None:
-            return None
-        facts, tensors = found
-        parts: list[dict[str, Tensor]] = [{} for _ in facts["names"]]
-        for key, value in tensors.items():
-            index, _, name = key.partition("/")
-            parts[int(index)][name] = value
-        buckets = [(tuple(names), part) for names, part in zip(facts["names"], parts, strict=True)]
-        return cls(
-            run_key=run_key,
-            step=facts["step"],
-            buckets=buckets,
-            records=facts["records"],
-            looks=facts["looks"],
-        )
+
+        def build(facts: dict[str, Any], tensors: dict[str, Tensor]) -> Checkpoint:
+            all_names = decode(tuple[tuple[str, ...], ...], facts.pop("names"), where="names")
+            parts: list[dict[str, Tensor]] = [{} for _ in all_names]
+            for key, value in tensors.items():
+                index, _, name = key.partition("/")
+                parts[int(index)][name] = value
+            buckets = list(zip(all_names, parts, strict=True))
+            return cls(**load_fields(cls, facts, {}, folder, given=("buckets",)), buckets=buckets)
+
+        return load_resume_point(folder, SCHEMA, run_key, build)

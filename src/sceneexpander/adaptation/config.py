@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated
+
+from sceneexpander.ranges import LearningRate, Range, Share, Steps, Weight, check_ranges
 
 
 class DepthDistance(StrEnum):
@@ -83,52 +86,48 @@ class EngineConfig:
     """How the steps are computed, not what: memory against time. Only ``moments: int8`` changes results beyond rounding."""
 
     checkpoint_activations: bool = False  # recompute activations in the backward pass
-    views_per_chunk: int = 0  # views that a dense head works on at once; 0: the model's own choice
+    # views that a dense head works on at once; 0: the model's own choice
+    views_per_chunk: Annotated[int, Range(0, 1000)] = 0
     compile: bool = False  # torch.compile of the transformer blocks; the first steps are slow
     start_on_host: bool = False  # keep theta_0 in host memory; of use on a GPU
     moments: MomentsForm = MomentsForm.FP32
 
     def __post_init__(self) -> None:
-        if self.views_per_chunk < 0:
-            raise ValueError(f"adapt.engine.views_per_chunk must be >= 0, is {self.views_per_chunk}")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlateauConfig:
     """Stop early once the loss no longer falls: see `sceneexpander.adaptation.plateau`."""
 
-    window: int = 0  # steps that are averaged; 0: never stop early
-    tolerance: float = 0.02  # least relative fall from one window to the next
+    window: Steps = 0  # steps that are averaged; 0: never stop early
+    tolerance: Annotated[float, Range(0, 1, high_open=True)] = 0.02  # least relative fall from one window to the next
 
     def __post_init__(self) -> None:
-        if self.window < 0 or not 0 <= self.tolerance < 1:
-            raise ValueError("adapt.plateau: window must be >= 0 and tolerance in [0, 1)")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AugmentConfig:
     """Geometry-perturbation augmentation of captured views. Magnitudes are ours: the paper only says "weak"."""
 
-    identity: float = 0.25  # probabilities of the four modes, per view; they must sum to 1
-    global_affine: float = 0.25
-    blockwise: float = 0.25
-    global_and_block: float = 0.25
-    rotation_deg: float = 3.0  # uniform in +- this
-    translation: float = 0.03  # share of the image size
-    scale: float = 0.03  # log-scale, +- this
-    shear_deg: float = 2.0
-    grid: int = 3  # blocks per side
-    block_strength: float = 0.5  # block magnitudes relative to the global ones
-    feather: float = 1 / 6  # blending width as a share of a block's side
+    identity: Share = 0.25  # probabilities of the four modes, per view; they must sum to 1
+    global_affine: Share = 0.25
+    blockwise: Share = 0.25
+    global_and_block: Share = 0.25
+    rotation_deg: Annotated[float, Range(0, 180)] = 3.0  # uniform in +- this
+    translation: Share = 0.03  # share of the image size
+    scale: Annotated[float, Range(0, 2)] = 0.03  # log-scale, +- this
+    shear_deg: Annotated[float, Range(0, 60)] = 2.0
+    grid: Annotated[int, Range(1, 64)] = 3  # blocks per side
+    block_strength: Annotated[float, Range(0, 10)] = 0.5  # block magnitudes relative to the global ones
+    feather: Annotated[float, Range(0, 0.5)] = 1 / 6  # blending width as a share of a block's side
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         total = self.identity + self.global_affine + self.blockwise + self.global_and_block
-        if abs(total - 1) > 1e-6 or min(self.identity, self.global_affine, self.blockwise, self.global_and_block) < 0:
-            raise ValueError(
-                f"adapt.augment: the four mode probabilities must be >= 0 and sum to 1, they sum to {total}"
-            )
-        if self.grid < 1 or not 0 <= self.feather <= 0.5:
-            raise ValueError("adapt.augment: grid must be >= 1 and feather within [0, 0.5]")
+        if abs(total - 1) > 1e-6:
+            raise ValueError(f"the four mode probabilities must sum to 1, they sum to {total}")
 
     @property
     def enabled(self) -> bool:
@@ -140,62 +139,45 @@ class AugmentConfig:
 class AdaptConfig:
     """Algorithm 1. Defaults are the paper's values where it gives them (T, p, lr, alpha, beta, lambda, r)."""
 
-    steps: int = 400  # T
-    learning_rate: float = 1e-5
-    weight_decay: float = 0.01  # AdamW's own default; the paper does not state it
-    insertion_probability: float = 0.5  # p
-    ema_momentum: float = 0.999  # mu
-    restore_interval: int = 10  # K; 0 switches restoration off
-    restore_rate: float = 1e-3  # r
-    lambda_anchor: float = 1.0
-    lambda_gen: float = 5e-2
-    lambda_reg: float = 1e-4
-    alpha_depth: float = 0.2
-    alpha_normal: float = 0.2
-    beta_depth: float = 1.0
-    beta_normal: float = 1.0
-    camera_huber: float = 1.0  # beta of the smooth-L1 camera distance
+    steps: Steps = 400  # T
+    learning_rate: LearningRate = 1e-5
+    weight_decay: Annotated[float, Range(0, 10)] = 0.01  # AdamW's own default; the paper does not state it
+    insertion_probability: Share = 0.5  # p
+    ema_momentum: Annotated[float, Range(0, 1, high_open=True)] = 0.999  # mu
+    restore_interval: Steps = 10  # K; 0 switches restoration off
+    restore_rate: Share = 1e-3  # r
+    lambda_anchor: Weight = 1.0
+    lambda_gen: Weight = 5e-2
+    lambda_reg: Weight = 1e-4
+    alpha_depth: Weight = 0.2
+    alpha_normal: Weight = 0.2
+    beta_depth: Weight = 1.0
+    beta_normal: Weight = 1.0
+    camera_huber: Annotated[float, Range(0, 1000, low_open=True)] = 1.0  # beta of the smooth-L1 camera distance
     depth_distance: DepthDistance = DepthDistance.L1
     drift: DriftForm = DriftForm.SUM
     gauge: Gauge = Gauge.KEEP_FIRST
     subset: SubsetRule = SubsetRule.PAPER
     # Beyond the paper: see the modules gaussian_head, consistency, gaps, realign and tone.
-    splat_steps: int = 0  # steps of the Gaussian head alone on the captured photos, after Algorithm 1; 0: none
-    splat_learning_rate: float = 3e-3
-    splat_others: float = 0.5  # weight of the same photos without the view's own Gaussians
+    splat_steps: Steps = 0  # steps of the Gaussian head alone on the captured photos, after Algorithm 1; 0: none
+    splat_learning_rate: LearningRate = 3e-3
+    splat_others: Weight = 0.5  # weight of the same photos without the view's own Gaussians
     inserted_weights: InsertedWeights = InsertedWeights.UNIFORM
     realign: Realign = Realign.NONE
-    tone: bool = False  # bring the inserted picture to the photos' exposure and white balance, see `sceneexpander.adaptation.tone`
+    # bring the inserted picture to the photos' exposure and white balance, see `sceneexpander.adaptation.tone`
+    tone: bool = False
     trust: bool = False  # generated Gaussians fade where captured views contradict them, see `consistency.trusted`
-    close_gaps: float = (
-        0.0  # reach of generated Gaussians of new space, in distances between neighbours, see `gaps.closed`; 0: as made
-    )
+    # reach of generated Gaussians of new space, in distances between neighbours, see `gaps.closed`; 0: as made
+    close_gaps: Annotated[float, Range(0, 100)] = 0.0
     warp_targets: bool = False  # move the anchors of a warped view with its pixels
     precision: Precision = Precision.FP32
-    checkpoint_every: int = 25  # steps between resume points; 0: none
+    checkpoint_every: Steps = 25  # steps between resume points; 0: none
     trainable: Trainable = Trainable.ALL
-    lora_rank: int = 8  # of the changes, if trainable is lora
+    lora_rank: Annotated[int, Range(1, 1024)] = 8  # of the changes, if trainable is lora
     plateau: PlateauConfig = field(default_factory=PlateauConfig)
-    observe_every: int = 60  # steps between looks, see `sceneexpander.adaptation.observe`; 0: none
+    observe_every: Steps = 60  # steps between looks, see `sceneexpander.adaptation.observe`; 0: none
     engine: EngineConfig = field(default_factory=EngineConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
 
     def __post_init__(self) -> None:
-        problems = [
-            (self.steps >= 0, f"steps must be >= 0, is {self.steps}"),
-            (self.learning_rate > 0, f"learning_rate must be > 0, is {self.learning_rate}"),
-            (0 <= self.insertion_probability <= 1, f"insertion_probability is {self.insertion_probability}"),
-            (0 <= self.ema_momentum < 1, f"ema_momentum must be in [0, 1), is {self.ema_momentum}"),
-            (0 <= self.restore_rate <= 1, f"restore_rate must be in [0, 1], is {self.restore_rate}"),
-            (self.restore_interval >= 0, f"restore_interval must be >= 0, is {self.restore_interval}"),
-            (self.lora_rank >= 1, f"lora_rank must be >= 1, is {self.lora_rank}"),
-            (self.observe_every >= 0, f"observe_every must be >= 0, is {self.observe_every}"),
-            (self.camera_huber > 0, f"camera_huber must be > 0, is {self.camera_huber}"),
-            (self.splat_steps >= 0, f"splat_steps must be >= 0, is {self.splat_steps}"),
-            (self.splat_learning_rate > 0, f"splat_learning_rate must be > 0, is {self.splat_learning_rate}"),
-            (self.close_gaps >= 0, f"close_gaps must be >= 0, is {self.close_gaps}"),
-            (self.splat_others >= 0, f"splat_others must be >= 0, is {self.splat_others}"),
-        ]
-        for fine, message in problems:
-            if not fine:
-                raise ValueError(f"adapt.{message}")
+        check_ranges(self)

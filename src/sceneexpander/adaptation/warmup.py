@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,22 +20,22 @@ from sceneexpander.adaptation.photometric import photometric_error, renderable
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.models.protocol import ALL_HEADS, Prediction, Reconstructor, as_module
+from sceneexpander.ranges import LearningRate, OpenShare, Range, Share, Steps, Weight, check_ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WarmupConfig:
     """How long and how strongly to fit the captured views before anything is inserted."""
 
-    steps: int = 0  # 0: off
-    learning_rate: float = 2e-4
-    held_out: float = 0.25  # share of the cells that the loss never sees
-    cell_px: int = 16
-    others_weight: float = 1.0  # weight of the rendering without the view's own Gaussians
-    min_alpha: float = 0.5  # pixels of that rendering count where the other views cover them at least this much
+    steps: Steps = 0  # 0: off
+    learning_rate: LearningRate = 2e-4
+    held_out: OpenShare = 0.25  # share of the cells that the loss never sees
+    cell_px: Annotated[int, Range(1, 4096)] = 16
+    others_weight: Weight = 1.0  # weight of the rendering without the view's own Gaussians
+    min_alpha: Share = 0.5  # pixels of that rendering count where the other views cover them at least this much
 
     def __post_init__(self) -> None:
-        if self.steps < 0 or not 0 < self.held_out < 1 or self.cell_px < 1:
-            raise ValueError("warmup: steps must be >= 0, held_out within (0, 1), cell_px >= 1")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

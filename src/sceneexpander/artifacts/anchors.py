@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.artifacts.store import load_artifact, require_tensor, save_artifact
+from sceneexpander.artifacts.store import load_artifact, load_fields, refusing, save_artifact
 
 SCHEMA = "anchors/1"
 
@@ -45,14 +45,10 @@ class Anchors:
 
     @classmethod
     def load(cls, folder: Path) -> Anchors:
-        """Read what `save` wrote."""
+        """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
         facts, tensors = load_artifact(folder, SCHEMA)
-        return cls(
-            weights_sha256=facts["weights_sha256"],
-            view_ids=tuple(facts["view_ids"]),
-            gauge_view=facts["gauge_view"],
-            **{name: require_tensor(tensors, name, folder) for name in _TENSORS},
-        )
+        with refusing(folder):
+            return cls(**load_fields(cls, facts, tensors, folder))
 
 
 _TENSORS = tuple(f.name for f in fields(Anchors) if f.name not in {"weights_sha256", "view_ids", "gauge_view"})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneexpander.artifacts.store import load_artifact, save_artifact
+from sceneexpander.artifacts.store import FACTS_NAME, load_artifact, read_typed, save_artifact
 
 SCHEMA = "cameras/1"
 
@@ -76,14 +76,4 @@ class CameraReport:
     def load(cls, folder: Path) -> CameraReport:
         """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
         facts, _ = load_artifact(folder, SCHEMA)
-        views = tuple(
-            ViewCamera(
-                **{
-                    **item,
-                    "warnings": tuple(item["warnings"]),
-                    "distortion": (item["distortion"][0], item["distortion"][1]),
-                }
-            )
-            for item in facts["views"]
-        )
-        return cls(views=views, notes=tuple(facts["notes"]))
+        return read_typed(cls, facts, folder / FACTS_NAME)

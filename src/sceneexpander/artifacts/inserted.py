@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from sceneexpander.artifacts.store import load_artifact, save_artifact
+from sceneexpander.artifacts.store import FACTS_NAME, load_artifact, read_typed, refusing, save_artifact
 from sceneexpander.artifacts.views import ViewSet
 
 SCHEMA = "inserted/1"
@@ -25,11 +24,6 @@ class Provenance:
     request_id: str | None = None
     cost_usd: float | None = None
     refusal: str | None = None
-
-    @classmethod
-    def from_plain(cls, item: dict[str, Any]) -> Provenance:
-        """From the JSON form."""
-        return cls(**{**item, "reference_sha256": tuple(item["reference_sha256"])})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,11 +49,19 @@ class InsertedView:
 
     @classmethod
     def load(cls, folder: Path) -> InsertedView:
-        """Read what `save` wrote."""
+        """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
         facts, _ = load_artifact(folder, SCHEMA)
-        return cls(
-            round=facts["round"],
-            view=ViewSet.load(folder / "view"),
-            chosen=facts["chosen"],
-            provenance=tuple(Provenance.from_plain(item) for item in facts["provenance"]),
-        )
+        read = read_typed(_Facts, facts, folder / FACTS_NAME)
+        with refusing(folder):
+            return cls(
+                round=read.round, view=ViewSet.load(folder / "view"), chosen=read.chosen, provenance=read.provenance
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Facts:
+    """Everything of an `InsertedView` but the view, which is an artefact of its own."""
+
+    round: int
+    chosen: int
+    provenance: tuple[Provenance, ...]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
+from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed, write_json_atomic
 
 SCHEMA = "metrics/1"
 UNAVAILABLE_SCHEMA = "metrics-unavailable/1"
@@ -140,12 +140,7 @@ class MetricsRow:
         content = read_json(path)
         if not isinstance(content, dict) or content.pop("schema", None) != SCHEMA:
             raise ArtifactError(f"is not of schema {SCHEMA!r}", where=path, fix="rerun the evaluation")
-        try:
-            truth = content.pop("truth")
-            views = tuple(ViewMetrics(**item) for item in content.pop("views"))
-            return cls(**content, views=views, truth=None if truth is None else TruthMetrics(**truth))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ArtifactError(f"is invalid ({error})", where=path, fix="rerun the evaluation") from None
+        return read_typed(cls, content, path, fix="rerun the evaluation")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,7 +167,4 @@ def load_row(path: Path) -> Row:
     content = read_json(path)
     if not isinstance(content, dict) or content.pop("schema", None) != UNAVAILABLE_SCHEMA:
         return MetricsRow.load(path)
-    try:
-        return UnavailableRow(**content)
-    except TypeError as error:
-        raise ArtifactError(f"is invalid ({error})", where=path, fix="rerun the evaluation") from None
+    return read_typed(UnavailableRow, content, path, fix="rerun the evaluation")

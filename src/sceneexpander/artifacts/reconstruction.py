@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.artifacts.store import ArtifactError, load_artifact, require_tensor, save_artifact
+from sceneexpander.artifacts.store import load_artifact, load_fields, refusing, save_artifact
 from sceneexpander.geometry.gaussians import GaussianCounts, Gaussians
 
 SCHEMA = "reconstruction/1"
@@ -63,19 +63,7 @@ class Reconstruction:
     def load(cls, folder: Path) -> Reconstruction:
         """Read what `save` wrote. Raises `ArtifactError` for a damaged or invalid artefact."""
         facts, tensors = load_artifact(folder, SCHEMA)
-        gaussians = Gaussians(
-            **{f.name: require_tensor(tensors, f"gaussians.{f.name}", folder) for f in fields(Gaussians)}
-        )
-        views = {name: require_tensor(tensors, name, folder) for name in (*_VIEW_TENSORS, "generated", "posed")}
-        try:
-            return cls(
-                method=facts["method"],
-                model=facts["model"],
-                weights_sha256=facts["weights_sha256"],
-                view_ids=tuple(facts["view_ids"]),
-                gaussians=gaussians,
-                counts=None if facts.get("counts") is None else GaussianCounts(**facts["counts"]),
-                **views,
-            )
-        except (TypeError, ValueError) as error:
-            raise ArtifactError(f"is invalid ({error})", where=folder, fix="rerun the stage that makes it") from None
+        with refusing(folder):
+            gaussians = Gaussians(**load_fields(Gaussians, {}, tensors, folder, prefix="gaussians."))
+            facts_and_views = load_fields(cls, facts, tensors, folder, given=("gaussians",))
+            return cls(**facts_and_views, gaussians=gaussians)

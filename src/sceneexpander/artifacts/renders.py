@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.artifacts.store import ArtifactError, load_artifact, require_tensor, save_artifact
+from sceneexpander.artifacts.store import ArtifactError, check_inside, load_artifact, load_fields, save_artifact
 
 SCHEMA = "renders/1"
 _TENSORS = ("world_from_cam", "intrinsics_px")
@@ -58,18 +58,15 @@ class Renders:
 
     @classmethod
     def load(cls, folder: Path) -> Renders:
-        """Read what `save` wrote."""
+        """Read what `save` wrote. Raises `ArtifactError` if it or one of its files is missing or damaged."""
         facts, tensors = load_artifact(folder, SCHEMA)
-        values = {name: facts[name] for name in cls.__dataclass_fields__ if name not in _TENSORS}
-        values |= {name: require_tensor(tensors, name, folder) for name in _TENSORS}
-        values["stills"] = tuple((int(index), dict(pictures)) for index, pictures in facts["stills"])
-        values["views"] = tuple((str(view), str(name)) for view, name in facts["views"])
-        renders = cls(**values)
+        renders = cls(**load_fields(cls, facts, tensors, folder))
         renders._check(folder)
         return renders
 
     def _check(self, folder: Path) -> None:
         stills = [name for _, pictures in self.stills for name in pictures.values()]
         for name in (*self.videos.values(), *stills, *(name for _, name in self.views), self.scene):
+            check_inside(name, folder)
             if not (folder / name).is_file():
                 raise ArtifactError("is missing", where=folder / name, fix="rerun the render stage")

@@ -8,7 +8,14 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.artifacts.store import ArtifactError, load_artifact, save_artifact
+from sceneexpander.artifacts.store import (
+    FACTS_NAME,
+    ArtifactError,
+    load_artifact,
+    load_fields,
+    read_typed,
+    save_artifact,
+)
 from sceneexpander.artifacts.views import ViewSet
 
 SCHEMA = "scene/1"
@@ -32,8 +39,8 @@ class RoundSpec:
 class KnownCameras:
     """Cameras that came with the photos (all views), in the first view's frame, intrinsics of the stored images."""
 
-    world_from_cam: Float[Tensor, "view 4 4"] | None
-    intrinsics_px: Float[Tensor, "view 3 3"] | None
+    world_from_cam: Float[Tensor, "view 4 4"] | None = None
+    intrinsics_px: Float[Tensor, "view 3 3"] | None = None
     metric: bool = False  # True only if translations are known to be metres
 
 
@@ -72,19 +79,22 @@ class Scene:
 
     @classmethod
     def load(cls, folder: Path) -> Scene:
-        """Read what `save` wrote."""
+        """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
         facts, tensors = load_artifact(folder, SCHEMA)
+        read = read_typed(_Facts, facts, folder / FACTS_NAME)
         known = None
         if tensors:
-            known = KnownCameras(
-                world_from_cam=tensors.get("known.world_from_cam"),
-                intrinsics_px=tensors.get("known.intrinsics_px"),
-                metric=bool(facts["metric"]),
-            )
+            known = KnownCameras(**load_fields(KnownCameras, {"metric": read.metric}, tensors, folder, prefix="known."))
         return cls(
-            name=facts["name"],
-            views=ViewSet.load(folder / "views"),
-            rounds=tuple(RoundSpec(**item) for item in facts["rounds"]),
-            known=known,
-            notes=tuple(facts.get("notes", ())),
+            name=read.name, views=ViewSet.load(folder / "views"), rounds=read.rounds, known=known, notes=read.notes
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Facts:
+    """What is not a tensor or an artefact of its own."""
+
+    name: str
+    rounds: tuple[RoundSpec, ...]
+    metric: bool
+    notes: tuple[str, ...]

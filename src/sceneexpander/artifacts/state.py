@@ -8,7 +8,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sceneexpander.artifacts.store import ArtifactError, load_artifact, save_artifact, sha256_of_tensors
+from sceneexpander.artifacts.store import (
+    FACTS_NAME,
+    RERUN,
+    ArtifactError,
+    load_artifact,
+    load_fields,
+    read_typed,
+    save_artifact,
+    sha256_of_tensors,
+)
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.geometry.priors import Priors
 
@@ -24,8 +33,11 @@ def save_priors(folder: Path, priors: Priors) -> None:
 
 def load_priors(folder: Path) -> Priors:
     """Read what `save_priors` wrote."""
-    _, tensors = load_artifact(folder, PRIORS_SCHEMA)
-    return Priors(**tensors)
+    facts, tensors = load_artifact(folder, PRIORS_SCHEMA)
+    unknown = tensors.keys() - {f.name for f in fields(Priors)}
+    if unknown:
+        raise ArtifactError(f"holds unknown tensors {sorted(unknown)[:3]}", where=folder, fix=RERUN)
+    return Priors(**load_fields(Priors, facts, tensors, folder))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,7 +88,13 @@ class WeightsChange:
     def load(cls, folder: Path) -> WeightsChange:
         """Read what `save` wrote."""
         facts, tensors = load_artifact(folder, WEIGHTS_SCHEMA)
-        return cls(base_sha256=facts["base_sha256"], change=tensors)
+        read = read_typed(_ChangeFacts, facts, folder / FACTS_NAME)
+        return cls(base_sha256=read.base_sha256, change=tensors)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ChangeFacts:
+    base_sha256: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,21 +15,27 @@ import json
 import logging
 import os
 import shutil
+import types
+import typing
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from safetensors import SafetensorError
 
 from sceneexpander.errors import UserError
+from sceneexpander.typed import REFUSALS, DecodeError, decode, decode_dataclass, describe, fields_of, shorten
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 FACTS_NAME = "artifact.json"
 TENSORS_NAME = "tensors.safetensors"
+MAX_NAME_BYTES = 1024  # of a file inside an artefact, with its folders
+RERUN = "rerun the stage that makes it"
+T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 
@@ -66,13 +72,43 @@ def write_json_atomic(path: Path, content: object) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. Raises `ArtifactError` naming the file if it is missing or malformed."""
+    """Read a JSON file. Raises `ArtifactError` naming the file if it is missing, not a file, or malformed."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        if path.exists() and not path.is_file():
+            raise ArtifactError("is not a file", where=path, fix="delete it and rerun its stage")
+        return json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except FileNotFoundError:
         raise ArtifactError("does not exist", where=path, fix="run the stage that makes it") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ArtifactError(f"is not valid JSON ({error})", where=path, fix="delete it and rerun its stage") from None
+    except OSError as error:
+        raise ArtifactError(f"cannot be read ({error.strerror})", where=path) from None
+    except RecursionError:
+        raise ArtifactError("is nested too deeply", where=path, fix="delete it and rerun its stage") from None
+    except ValueError as error:  # malformed, not UTF-8, or a number of thousands of digits
+        reason = shorten(str(error), 200)
+        raise ArtifactError(f"is not valid JSON ({reason})", where=path, fix="delete it and rerun its stage") from None
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"it holds {name}")
+
+
+def read_typed(schema: type[T], content: object, path: Path, *, fix: str = RERUN, extra: bool = False) -> T:
+    """Plain values that ``path`` holds as a dataclass.
+
+    Args:
+        schema: a dataclass type.
+        content: a mapping of plain values.
+        path: where they come from, for messages.
+        fix: what to do about a file that holds something else.
+        extra: pass over keys that are no fields.
+
+    Raises:
+        ArtifactError: something is missing, unknown, or of another type; names the file and the key.
+    """
+    try:
+        return decode_dataclass(schema, content, extra=extra)
+    except DecodeError as error:
+        raise ArtifactError(f"is invalid ({error.where}: {error.problem})", where=path, fix=fix) from None
 
 
 def to_plain(value: object) -> Any:
@@ -129,12 +165,90 @@ def save_artifact(folder: Path, schema: str, facts: Mapping[str, object], tensor
     write_json_atomic(folder / FACTS_NAME, {**to_plain(facts), "schema": schema})
 
 
+def check_inside(name: str, folder: Path) -> None:
+    """Raise `ArtifactError` if a file name that an artefact holds leads out of its folder, or can be none."""
+    parts = Path(name).parts
+    if not parts or Path(name).is_absolute() or ".." in parts or "\0" in name or len(name.encode()) > MAX_NAME_BYTES:
+        raise ArtifactError(f"names a file {shorten(name)!a}, which is not inside it", where=folder, fix=RERUN)
+
+
+@contextlib.contextmanager
+def refusing(folder: Path) -> Iterator[None]:
+    """Turn what a dataclass says about values that do not go together into an `ArtifactError` about the folder they came from."""
+    try:
+        yield
+    except DecodeError as error:
+        raise ArtifactError(f"is invalid ({error.where}: {error.problem})", where=folder, fix=RERUN) from None
+    except UserError:
+        raise
+    except REFUSALS as error:
+        raise ArtifactError(f"is invalid ({shorten(str(error), 300)})", where=folder, fix=RERUN) from None
+
+
+def load_fields(
+    schema: type,
+    facts: Mapping[str, object],
+    tensors: Mapping[str, Tensor],
+    folder: Path,
+    *,
+    prefix: str = "",
+    given: Collection[str] = (),
+) -> dict[str, Any]:
+    """Arguments of a dataclass out of an artefact: tensors for the fields that are annotated as such, facts for all others.
+
+    Args:
+        schema: the dataclass.
+        facts: plain values by field, all of which must be fields.
+        tensors: by name.
+        folder: of the artefact, for messages.
+        prefix: of the tensors' names.
+        given: fields that come from elsewhere.
+
+    Raises:
+        ArtifactError: something without a default is missing, or of another type, rank or number type.
+    """
+    hints, required = fields_of(schema)
+    unknown = sorted(facts.keys() - (hints.keys() - set(given)))
+    if unknown:
+        raise ArtifactError(f"is invalid ({shorten(unknown[0])}: unknown key)", where=folder / FACTS_NAME, fix=RERUN)
+    found: dict[str, Any] = {}
+    for name, hint in hints.items():
+        if name in given:
+            continue
+        if name in facts:
+            try:
+                found[name] = decode(hint, facts[name], where=name)
+            except DecodeError as error:
+                problem = f"is invalid ({error.where}: {error.problem})"
+                raise ArtifactError(problem, where=folder / FACTS_NAME, fix=RERUN) from None
+        elif kinds := _tensor_kinds(hint):
+            if prefix + name in tensors:
+                value = tensors[prefix + name]
+                if not isinstance(value, kinds):
+                    shape = f"{tuple(value.shape)} of {str(value.dtype).removeprefix('torch.')}"
+                    problem = f"tensor {prefix + name!r} is {shape}, expected {kinds[0].__name__}"
+                    raise ArtifactError(problem, where=folder / TENSORS_NAME, fix=RERUN)
+                found[name] = value
+            elif name in required:
+                require_tensor(tensors, prefix + name, folder)
+        elif name in required:
+            raise ArtifactError(f"is invalid ({name}: missing key)", where=folder / FACTS_NAME, fix=RERUN)
+    return found
+
+
+def _tensor_kinds(hint: Any) -> tuple[type, ...]:
+    """The annotated tensor types among the alternatives of a type."""
+    options = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+    return tuple(option for option in options if hasattr(option, "array_type"))
+
+
 def load_artifact(folder: Path, schema: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """(facts, tensors) of a folder written by `save_artifact`, refusing other schemas."""
+    """(facts without the schema, tensors) of a folder written by `save_artifact`, refusing other schemas."""
     facts = read_json(folder / FACTS_NAME)
-    if not isinstance(facts, dict) or facts.get("schema") != schema:
-        found = facts.get("schema") if isinstance(facts, dict) else type(facts).__name__
-        raise ArtifactError(f"holds {found!r}, expected {schema!r}", where=folder, fix="rerun the stage that makes it")
+    found = facts.pop("schema", None) if isinstance(facts, dict) else type(facts).__name__
+    if found != schema:
+        shown = repr(shorten(found)) if isinstance(found, str) else describe(found)
+        raise ArtifactError(f"holds {shown}, expected {schema!r}", where=folder, fix=RERUN)
     path = folder / TENSORS_NAME
     if not path.exists():
         return facts, {}
@@ -148,20 +262,30 @@ def load_artifact(folder: Path, schema: str) -> tuple[dict[str, Any], dict[str, 
         ) from None
 
 
-def load_resume_point(folder: Path, schema: str, run_key: str) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
-    """(facts, tensors) of an artefact whose fact ``run_key`` is the given one, or None; what else lies there is reported and ignored."""
+def load_resume_point(
+    folder: Path, schema: str, run_key: str, build: Callable[[dict[str, Any], dict[str, Tensor]], T]
+) -> T | None:
+    """What ``build`` makes of an artefact whose fact ``run_key`` is the given one, or None; what else lies there is reported and ignored.
+
+    Args:
+        folder: of the artefact.
+        schema: of the artefact.
+        run_key: of the run that is to go on.
+        build: from facts and tensors; whatever it says about values that are none makes the artefact a damaged one.
+    """
     _tidy(folder)
     if not folder.exists():
         return None
     try:
         facts, tensors = load_artifact(folder, schema)
+        if facts.get("run_key") != run_key:
+            _log.warning("ignoring a checkpoint of another run in %s", folder)
+            return None
+        with refusing(folder):
+            return build(facts, tensors)
     except ArtifactError as error:
         _log.warning("ignoring a damaged checkpoint: %s", error.line())
         return None
-    if facts["run_key"] != run_key:
-        _log.warning("ignoring a checkpoint of another run in %s", folder)
-        return None
-    return facts, tensors
 
 
 def require_tensor(tensors: Mapping[str, Tensor], name: str, folder: Path) -> Tensor:

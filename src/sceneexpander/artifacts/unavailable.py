@@ -5,7 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneexpander.artifacts.store import FACTS_NAME, directory_being_written, load_artifact, read_json, save_artifact
+from sceneexpander.artifacts.store import (
+    FACTS_NAME,
+    directory_being_written,
+    load_artifact,
+    read_json,
+    read_typed,
+    save_artifact,
+)
 
 SCHEMA = "unavailable/1"
 
@@ -26,7 +33,7 @@ class Unavailable:
     def load(cls, folder: Path) -> Unavailable:
         """Read what `save` wrote."""
         facts, _ = load_artifact(folder, SCHEMA)
-        return cls(method=facts["method"], model=facts["model"], reason=facts["reason"])
+        return read_typed(cls, facts, folder / FACTS_NAME)
 
 
 def unavailable_in(folder: Path) -> Unavailable | None:

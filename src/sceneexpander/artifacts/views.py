@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,16 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from sceneexpander.artifacts.store import ArtifactError, load_artifact, save_artifact
+from sceneexpander.artifacts.store import (
+    FACTS_NAME,
+    RERUN,
+    ArtifactError,
+    check_inside,
+    load_artifact,
+    read_typed,
+    refusing,
+    save_artifact,
+)
 
 SCHEMA = "views/2"
 Affine = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -160,28 +169,25 @@ class ViewSet:
     def load(cls, folder: Path) -> ViewSet:
         """Read what `save` wrote. Raises `ArtifactError` if a picture or record is missing or damaged."""
         facts, tensors = load_artifact(folder, SCHEMA)
-        records = tuple(_record_from_plain(item) for item in facts["records"])
+        records = read_typed(_Facts, facts, folder / FACTS_NAME).records
         if not records:
-            raise ArtifactError("holds no views", where=folder, fix="rerun the stage that makes it")
-        images = torch.stack([load_png(folder / "images" / f"{r.view_id}.png") for r in records])
-        detail = torch.stack([load_png(folder / "detail" / f"{r.view_id}.png") for r in records])
-        valid = tensors["valid"].to(torch.bool) if "valid" in tensors else None
-        if valid is not None and valid.shape != (len(records), *images.shape[2:]):
-            raise ArtifactError("holds masks of another size", where=folder, fix="rerun the stage that makes it")
-        return cls(records=records, images=images, detail_images=detail, valid=valid)
+            raise ArtifactError("holds no views", where=folder, fix=RERUN)
+        for record in records:
+            if Path(record.view_id).name != record.view_id:
+                raise ArtifactError(f"has a view {record.view_id!a}, which is no file name", where=folder, fix=RERUN)
+            check_inside(record.view_id, folder)
+        with refusing(folder):
+            images = torch.stack([load_png(folder / "images" / f"{r.view_id}.png") for r in records])
+            detail = torch.stack([load_png(folder / "detail" / f"{r.view_id}.png") for r in records])
+            valid = tensors["valid"].to(torch.bool) if "valid" in tensors else None
+            return cls(records=records, images=images, detail_images=detail, valid=valid)
 
 
-def _record_from_plain(item: dict[str, Any]) -> ViewRecord:
-    rows = item["stored_from_original"]
-    affine: Affine = ((rows[0][0], rows[0][1], rows[0][2]), (rows[1][0], rows[1][1], rows[1][2]))
-    lens = item.get("lens")
-    if lens is not None:
-        size = lens["exif_size"]
-        lens = LensFacts(**{**lens, "exif_size": None if size is None else (size[0], size[1])})
-    distortion = item.get("distortion", (0.0, 0.0))
-    return replace(
-        ViewRecord(**item), stored_from_original=affine, lens=lens, distortion=(distortion[0], distortion[1])
-    )
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Facts:
+    """What is not in the pictures."""
+
+    records: tuple[ViewRecord, ...]
 
 
 def to_uint8(image: Float[Tensor, "3 height width"]) -> np.ndarray[Any, np.dtype[np.uint8]]:

@@ -7,28 +7,41 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from yaml import YAMLError
+
+from sceneexpander.artifacts.store import to_plain
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import did_you_mean
+from sceneexpander.typed import shorten
 
 FORBIDDEN_KEYS = frozenset({"size", "nfiles"})  # the pipeline's cache key leaves these names out, silently
 DEFAULT_SCENE = "default"
+MAX_KEY = 200  # characters
+MAX_OVERRIDE = 20_000  # characters: key frames are the longest
+_ROOT = "config"
 
 
 def scene_option(conf: Path, scene: str) -> str:
     """The option of the ``scene`` group for a scene: its own file if there is one, else the default."""
-    return scene if (conf / "scene" / f"{scene}.yaml").is_file() else DEFAULT_SCENE
+    return scene if scene in options_of(conf, "scene") else DEFAULT_SCENE
+
+
+def options_of(conf: Path, group: str) -> list[str]:
+    """Names of the options of a group, e.g. of ``hydra/launcher``; empty if there is no such group."""
+    groups = {path.parent.relative_to(conf).as_posix() for path in conf.glob("*/**/*.yaml")}
+    return sorted(path.stem for path in (conf / group).glob("*.yaml")) if group in groups else []
 
 
 def compose(conf: Path, overrides: Sequence[str]) -> dict[str, Any]:
-    """Compose, resolve and validate. Returns plain values (what the validated types were built from).
+    """Compose, resolve and validate. Returns plain values, those of the validated types.
 
     Args:
         conf: the configuration folder.
         overrides: Hydra overrides, e.g. ``("adapt.steps=5", "ablation=anchor")``.
 
     Raises:
-        ConfigError: unknown group, option or key, missing value, wrong type; one line.
+        ConfigError: unknown group, option or key, missing value, wrong type, number out of range; one line.
     """
     from hydra import compose as hydra_compose
     from hydra.errors import HydraException
@@ -37,16 +50,81 @@ def compose(conf: Path, overrides: Sequence[str]) -> dict[str, Any]:
 
     with _initialised(conf):
         try:
-            composed = hydra_compose(config_name="config", overrides=list(overrides))
+            kept = [text for text in overrides if check_override(conf, text)]
+            composed = hydra_compose(config_name=_ROOT, overrides=kept)
             plain = OmegaConf.to_container(composed, resolve=True)
-        except (HydraException, OmegaConfBaseException) as error:
+        except RecursionError:
+            raise ConfigError("is nested too deeply", where=conf) from None
+        # Hydra lets errors of its own making through for values that it did not expect.
+        except (
+            HydraException,
+            OmegaConfBaseException,
+            ValueError,
+            TypeError,
+            LookupError,
+            OSError,
+            YAMLError,
+        ) as error:
             raise explain(error, conf, overrides) from None
     if not isinstance(plain, dict):
         raise ConfigError("composes to no sections", where=conf / "config.yaml")
     values = {str(key): value for key, value in plain.items()}
     refuse_forbidden_keys(values)
-    parse_dataclass(ProjectConfig, values)
-    return values
+    return to_plain(parse_dataclass(ProjectConfig, values))
+
+
+def check_override(conf: Path, text: str) -> bool:
+    """Whether an override is to be applied: not if it asks an optional group for nothing.
+
+    Hydra passes over options that an optional group does not have, and fails with a traceback at some values.
+
+    Raises:
+        ConfigError: it is no override, too long, a sweep, or names an option that its group does not have.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    name = text.lstrip("+~").partition("=")[0]
+    where = shorten(name) or "override"
+    if len(name) > MAX_KEY:
+        raise ConfigError(f"has {len(name)} characters, more than any key", where=where)
+    if len(text) > MAX_OVERRIDE:
+        raise ConfigError(f"has {len(text)} characters, at most {MAX_OVERRIDE} are read", where=where)
+    if not name or ("=" not in text and not text.startswith("~")):
+        raise ConfigError("is not KEY=VALUE", where=shorten(text) or "override")
+    try:
+        override = OverridesParser.create().parse_override(text)
+        value = override.value()
+    except RecursionError:
+        raise ConfigError("is nested too deeply", where=where) from None
+    # Beside its own errors, the parser lets those of very long numbers through.
+    except (HydraException, ValueError, TypeError, LookupError) as error:
+        reason = "a number of too many digits"
+        if "integer string conversion" not in str(error):
+            reason = str(error).partition("See https://hydra.cc")[0]
+        raise ConfigError(f"is no KEY=VALUE ({shorten(reason, 120)})", where=where, fix="put texts in quotes") from None
+    if override.is_sweep_override():
+        raise ConfigError("holds several values", where=where, fix="give one, or use sceneexpander.sweep")
+    group = override.key_or_group
+    options = options_of(conf, group)
+    if not options or override.is_delete():
+        return True
+    if value is None and _is_optional(conf, group):
+        return False
+    if not isinstance(value, str) or value not in options:
+        # As it was written: what Hydra reads may be a list or a number.
+        written = text.partition("=")[2]
+        raise ConfigError(
+            f"has no option {shorten(written)!r}", where=group, fix=did_you_mean(shorten(written), options)
+        )
+    return True
+
+
+def _is_optional(conf: Path, group: str) -> bool:
+    from omegaconf import OmegaConf
+
+    content: Any = OmegaConf.load(conf / f"{_ROOT}.yaml")
+    return any(not isinstance(entry, str) and f"optional {group}" in entry for entry in content.defaults)
 
 
 @contextmanager
@@ -78,23 +156,22 @@ def refuse_forbidden_keys(values: Mapping[str, Any], where: str = "") -> None:
 
 def explain(error: Exception, conf: Path, overrides: Sequence[str]) -> ConfigError:
     """Hydra's message as one line that names the override at fault and the nearest thing that exists."""
-    for override in overrides:
-        key, _, value = override.lstrip("+~").partition("=")
-        group = key.partition("@")[0]
-        folder = conf / group
-        if folder.is_dir():
-            options = [path.stem for path in folder.glob("*.yaml")]
-            if value not in options:
-                return ConfigError(f"has no option {value!r}", where=group, fix=did_you_mean(value, options))
-        elif str(error).find(key) >= 0:
-            return ConfigError("unknown key", where=key, fix=_nearest_key(conf, key))
+    known = known_keys(ProjectConfig)
     first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-    return ConfigError(first.strip(), where=conf)
+    for override in overrides:
+        key = override.lstrip("+~").partition("=")[0]
+        if key and key in str(error):
+            if key not in known:
+                return ConfigError("unknown key", where=key, fix=_nearest_key(conf, key, known))
+            return ConfigError(f"cannot be set ({shorten(first.strip(), 200)})", where=key)
+    return ConfigError(shorten(first.strip(), 200), where=conf)
 
 
-def _nearest_key(conf: Path, key: str) -> str:
+def _nearest_key(conf: Path, key: str, known: Sequence[str]) -> str:
     groups = [path.name for path in conf.iterdir() if path.is_dir()]
-    return did_you_mean(key, sorted({*known_keys(ProjectConfig), *groups}))
+    near = did_you_mean(key, sorted({*known, *groups}))
+    # All keys together would be a page.
+    return near if near.startswith("did you mean") else f"sections: {', '.join(k for k in known if '.' not in k)}"
 
 
 def known_keys(schema: type, prefix: str = "") -> list[str]:

@@ -11,18 +11,36 @@ import yaml
 
 from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.config.parse import ConfigError, parse_dataclass
+from sceneexpander.typed import shorten
 
 T = TypeVar("T")
 
 
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """YAML itself keeps the last of two equal keys and says nothing."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"has {key.value!r} twice", key.start_mark)
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path) -> Any:
-    """Plain values of a YAML file. Raises `ConfigError` naming the file if it is missing or malformed."""
+    """Plain values of a YAML file. Raises `ConfigError` naming the file if it is missing or malformed, or says something twice."""
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.load(path.read_text(encoding="utf-8"), _UniqueKeyLoader)  # noqa: S506 - a safe loader
     except FileNotFoundError:
         raise ConfigError("does not exist", where=path) from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"is not valid YAML ({error})", where=path) from None
+    except OSError as error:
+        raise ConfigError(f"cannot be read ({error.strerror})", where=path) from None
+    except RecursionError:
+        raise ConfigError("is nested too deeply", where=path) from None
+    # Beside its own errors, the loader lets those of dates and of very long numbers through.
+    except (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError) as error:
+        raise ConfigError(f"is not valid YAML ({shorten(str(error), 200)})", where=path) from None
 
 
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:

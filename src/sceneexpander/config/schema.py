@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Annotated
 
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.warmup import WarmupConfig
@@ -15,17 +17,21 @@ from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
 from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.ranges import Range, check_ranges
 from sceneexpander.rendering import RenderConfig
 from sceneexpander.tracking import TrackingConfig
+from sceneexpander.typed import shorten
+
+_DEVICE = re.compile(r"cpu|cuda(:[0-9]{1,3})?")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProjectConfig:
     """Everything that can be chosen. ``threads`` are torch's; 0 leaves them at its own choice."""
 
-    seed: int
+    seed: Annotated[int, Range(0, 2**63 - 1)]
     device: str  # "cpu", "cuda", "cuda:1"
-    threads: int
+    threads: Annotated[int, Range(0, 256)]
     scene: IngestConfig
     generator: GeneratorConfig
     model: ModelConfig
@@ -40,9 +46,6 @@ class ProjectConfig:
     tracking: TrackingConfig
 
     def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise UserError(f"must be >= 0, is {self.seed}", where="seed")
-        if self.threads < 0:
-            raise UserError(f"must be >= 0, is {self.threads}", where="threads")
-        if self.device != "cpu" and not self.device.startswith("cuda"):
-            raise UserError(f"is {self.device!r}", where="device", fix="use cpu, cuda or cuda:N")
+        check_ranges(self)
+        if not _DEVICE.fullmatch(self.device):
+            raise UserError(f"is {shorten(self.device)!r}", where="device", fix="use cpu, cuda or cuda:N")

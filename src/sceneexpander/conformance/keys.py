@@ -13,6 +13,12 @@ from sceneexpander.geometry.checks import OutputCheck
 from sceneexpander.models.weights import describe_mismatch
 
 
+def _size(value: object) -> int:
+    if type(value) is not int or value < 0:
+        raise ValueError("a size is a whole number")
+    return value
+
+
 def check_keys(path: Path) -> list[OutputCheck]:
     """Names, shapes and dtypes of the released model that the list belongs to, against the list.
 
@@ -23,8 +29,8 @@ def check_keys(path: Path) -> list[OutputCheck]:
     """
     recorded = read_config(path)
     try:
-        expected = {name: (tuple(int(n) for n in shape), str(dtype)) for name, (shape, dtype) in recorded.items()}
-    except (TypeError, ValueError):
+        expected = {name: (tuple(_size(n) for n in shape), str(dtype)) for name, (shape, dtype) in recorded.items()}
+    except (TypeError, ValueError, OverflowError, RecursionError):
         raise UserError("is not a key list (name -> [shape, dtype])", where=path, fix="fetch it again") from None
     family = next((family for family in key_families() if family.matches(expected.keys())), None)
     if family is None:

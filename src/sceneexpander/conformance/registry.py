@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from torch import nn
 
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.checks import OutputCheck
+from sceneexpander.typed import shorten
 
 # Modules with `CASES` (a list of CaseRunner) and `KEYS` (a list of KeyFamily); imported when the command runs.
 FAMILIES = (
@@ -57,8 +59,8 @@ def find_cases(path: Path) -> list[tuple[Path, CaseRunner]]:
     Raises:
         UserError: if the path does not exist or holds no case that a registered runner knows.
     """
-    if not path.exists():
-        raise UserError("does not exist", where=path, fix="give a conformance case folder")
+    if not os.path.exists(path):
+        raise UserError("does not exist", where=shorten(str(path), 300), fix="give a conformance case folder")
     runners = case_runners()
 
     def runner_of(candidate: Path) -> CaseRunner | None:
@@ -89,11 +91,18 @@ def read_config(path: Path) -> dict[str, Any]:
         UserError: if the file is missing or is not a JSON object.
     """
     try:
-        content = json.loads(path.read_text())
+        if os.path.exists(path) and not os.path.isfile(path):
+            raise UserError("is not a file", where=path, fix="fetch the case again")
+        content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError("does not exist", where=path, fix="the case is incomplete: fetch it again") from None
+    except RecursionError:
+        raise UserError("is nested too deeply", where=path, fix="fetch the case again") from None
     except (OSError, ValueError) as error:
-        raise UserError(f"is not readable JSON ({error})", where=path, fix="fetch the case again") from None
+        reason = shorten(str(error), 200)
+        raise UserError(
+            f"is not readable JSON ({reason})", where=shorten(str(path), 300), fix="fetch the case again"
+        ) from None
     if not isinstance(content, dict):
         raise UserError(f"holds a {type(content).__name__}, expected an object", where=path, fix="fetch the case again")
     return content

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sceneexpander.errors import UserError
+from sceneexpander.ranges import OpenShare, check_ranges
 from sceneexpander.splatting.settings import RasterSettings
 
 
@@ -19,14 +19,13 @@ class EvaluateConfig:
         st_lpips: also the perceptual distance, where the package ``stlpips-pytorch`` is installed.
     """
 
-    coverage_alpha: float = 0.5
+    coverage_alpha: OpenShare = 0.5
     antialiased: bool = False
     cross_view: bool = True
     st_lpips: bool = True
 
     def __post_init__(self) -> None:
-        if not 0 < self.coverage_alpha < 1:
-            raise UserError(f"must be between 0 and 1, is {self.coverage_alpha}", where="evaluate.coverage_alpha")
+        check_ranges(self)
 
     def raster_settings(self) -> RasterSettings:
         """As the renderer takes them."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sceneexpander.errors import UserError
 from sceneexpander.frontend.confidence import confidence_features, shipped_model
 from sceneexpander.frontend.dense_check import Agreement, check_view, without_small_parts
 from sceneexpander.frontend.dense_sweep import WORST_COST, WindowMatcher, sweep_offsets, sweep_planes
@@ -37,8 +38,10 @@ from sceneexpander.frontend.segments import segment_colours
 from sceneexpander.frontend.sgm import COST_SCALE, aggregate, best_hypothesis
 from sceneexpander.frontend.sparse_points import SparsePoints
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
+from sceneexpander.ranges import Range, Share, Weight, check_ranges
 
 Result = TypeVar("Result")
+MOST_PENALTY = 0.8
 
 _FULL_SIZE_PX = 320.0  # long side for which the pixel constants below were tuned
 
@@ -47,50 +50,70 @@ _FULL_SIZE_PX = 320.0  # long side for which the pixel constants below were tune
 class DenseConfig:
     """Constants of the dense matcher. Lengths in pixels are at the working resolution."""
 
-    work_px: int = 336  # long side at which matching runs; smaller images are matched as they are
-    threads: int = 2  # reference views worked on at the same time; does not change the result
-    planes: int = 96  # most depth hypotheses of the sweep
-    plane_step_px: float = 0.75  # fewer planes are used where this step in the widest source needs fewer
-    far_factor: float = 0.6  # farthest plane: this over the 98th percentile of sparse depth
-    near_factor: float = 4.0  # nearest plane: this over the 2nd percentile; what is near often has no point
-    sources: int = 4  # other views matched against each view, at most
-    min_parallax_px: float = 0.25  # sources with less motion per 10 % of depth are not used
-    window: int = 7  # side of the correlation window
-    prior: float = 0.15  # most that a plane pays for contradicting the sparse interpolation
-    prior_range: float = 0.7  # log-depth distance at which it pays that
-    penalty_near: float = 0.04  # semi-global matching: one hypothesis further
-    penalty_jump: float = 0.5  # more than one further, on an even surface
-    jump_contrast: float = 12.0  # lowers the jump penalty across grey-level edges
-    ambiguity_margin: float = 0.6  # aggregated cost within which another plane counts as nearly as good
-    refine_window: int = 5  # window of the refinement, which follows the surface and can be smaller
-    refine_offsets: int = 7  # hypotheses around the first result
-    refine_reach: float = 1.2  # the outermost of them, in planes
-    reprojection_px: float = 1.5  # cross-view check: largest distance after going there and back
-    depth_tolerance: float = 0.04  # and largest relative difference of depth
-    max_cost: float = 0.6  # a checked pixel must match better than this
-    min_part_px: int = 20  # smaller checked or confident islands are dropped (at 320 pixels; scaled by area)
-    min_confidence: float = 0.6  # probability of being within 5 % from which a pixel counts as confident
-    segment_tolerances: tuple[float, ...] = (0.8, 2.0, 4.0)  # colour segments, fine to coarse
-    min_segment_px: int = 40  # smallest segment (at 320 pixels; scaled by area)
-    plane_tolerance: float = 0.1  # relative error at which a sample stops supporting a segment's plane
-    min_plane_support: float = 0.6  # planes with less support are not used
-    plane_weights: tuple[float, ...] = (
-        0.2,
-        0.1,
-        0.04,
-    )  # weight of a fully supported plane in the final fill, per scale
-    smooth_reach: float = 0.035  # reach of the final fill as a share of the long side
-    stiffness: float = 4.0  # smoothness of the final fill against weights of 1
-    colour_sigma: float = 0.025  # colour step that stops the final fill
-    weight_agreed: float = 1.0  # checked, two or more other views agree
-    weight_checked: float = 0.6  # checked, one other view agrees
-    weight_raw: float = 0.001  # matched but not checked
-    weight_points: float = (
-        3000.0  # of all sparse points of a view together: many stand close and speak for little around them
-    )
-    weight_point: float = 60.0  # most of a single one: it speaks for the plain area around it, too
-    point_conflict: float = 0.1  # sparse points this far (log depth) from checked pixels around them are dropped
-    weight_interpolation: float = 0.0015  # interpolation of the sparse points
+    # long side at which matching runs; smaller images are matched as they are
+    work_px: Annotated[int, Range(16, 4096)] = 336
+    threads: Annotated[int, Range(1, 256)] = 2  # reference views worked on at the same time; does not change the result
+    planes: Annotated[int, Range(2, 1024)] = 96  # most depth hypotheses of the sweep
+    # fewer planes are used where this step in the widest source needs fewer
+    plane_step_px: Annotated[float, Range(0, 100, low_open=True)] = 0.75
+    # farthest plane: this over the 98th percentile of sparse depth
+    far_factor: Annotated[float, Range(0, 1, low_open=True)] = 0.6
+    # nearest plane: this over the 2nd percentile; what is near often has no point
+    near_factor: Annotated[float, Range(1, 1000)] = 4.0
+    sources: Annotated[int, Range(1, 100)] = 4  # other views matched against each view, at most
+    min_parallax_px: Annotated[float, Range(0, 1000)] = 0.25  # sources with less motion per 10 % of depth are not used
+    window: Annotated[int, Range(3, 63)] = 7  # side of the correlation window
+    prior: Annotated[float, Range(0, 0.8)] = 0.15  # most that a plane pays for contradicting the sparse interpolation
+    prior_range: Annotated[float, Range(0, 100, low_open=True)] = 0.7  # log-depth distance at which it pays that
+    penalty_near: Annotated[float, Range(0, 1)] = 0.04  # semi-global matching: one hypothesis further
+    penalty_jump: Annotated[float, Range(0, 0.8)] = 0.5  # more than one further, on an even surface
+    jump_contrast: Annotated[float, Range(0, 10_000)] = 12.0  # lowers the jump penalty across grey-level edges
+    # aggregated cost within which another plane counts as nearly as good
+    ambiguity_margin: Annotated[float, Range(0, 1.5)] = 0.6
+    # window of the refinement, which follows the surface and can be smaller
+    refine_window: Annotated[int, Range(3, 63)] = 5
+    refine_offsets: Annotated[int, Range(3, 101)] = 7  # hypotheses around the first result
+    refine_reach: Annotated[float, Range(0, 10, low_open=True)] = 1.2  # the outermost of them, in planes
+    # cross-view check: largest distance after going there and back
+    reprojection_px: Annotated[float, Range(0, 1000, low_open=True)] = 1.5
+    depth_tolerance: Annotated[float, Range(0, 1, low_open=True)] = 0.04  # and largest relative difference of depth
+    max_cost: Annotated[float, Range(0, 2)] = 0.6  # a checked pixel must match better than this
+    # smaller checked or confident islands are dropped (at 320 pixels; scaled by area)
+    min_part_px: Annotated[int, Range(0, 1_000_000)] = 20
+    min_confidence: Share = 0.6  # probability of being within 5 % from which a pixel counts as confident
+    # colour segments, fine to coarse
+    segment_tolerances: tuple[Annotated[float, Range(0, 255, low_open=True)], ...] = (0.8, 2.0, 4.0)
+    min_segment_px: Annotated[int, Range(1, 1_000_000)] = 40  # smallest segment (at 320 pixels; scaled by area)
+    # relative error at which a sample stops supporting a segment's plane
+    plane_tolerance: Annotated[float, Range(0, 10, low_open=True)] = 0.1
+    min_plane_support: Share = 0.6  # planes with less support are not used
+    # weight of a fully supported plane in the final fill, per scale
+    plane_weights: tuple[Annotated[float, Range(0, 1e6)], ...] = (0.2, 0.1, 0.04)
+    # reach of the final fill as a share of the long side
+    smooth_reach: Annotated[float, Range(0, 1, low_open=True)] = 0.035
+    stiffness: Annotated[float, Range(0, 1e6, low_open=True)] = 4.0  # smoothness of the final fill against weights of 1
+    colour_sigma: Annotated[float, Range(0, 10, low_open=True)] = 0.025  # colour step that stops the final fill
+    weight_agreed: Weight = 1.0  # checked, two or more other views agree
+    weight_checked: Weight = 0.6  # checked, one other view agrees
+    weight_raw: Weight = 0.001  # matched but not checked
+    # of all sparse points of a view together: many stand close and speak for little around them
+    weight_points: Weight = 3000.0
+    weight_point: Weight = 60.0  # most of a single one: it speaks for the plain area around it, too
+    # sparse points this far (log depth) from checked pixels around them are dropped
+    point_conflict: Annotated[float, Range(0, 100)] = 0.1
+    weight_interpolation: Annotated[float, Range(1e-9, 1e6)] = 0.0015  # interpolation of the sparse points
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        # Path costs of eight directions are added up in 16 bits.
+        if self.prior + self.penalty_jump > MOST_PENALTY:
+            total = f"{self.prior} + {self.penalty_jump}"
+            raise UserError(
+                f"and prior add up to {total}, must be at most {MOST_PENALTY} together", where="penalty_jump"
+            )
+        if not self.segment_tolerances or len(self.segment_tolerances) != len(self.plane_weights):
+            counts = f"{len(self.plane_weights)} weights for {len(self.segment_tolerances)} tolerances"
+            raise UserError(f"holds {counts}, must hold one for each", where="plane_weights")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

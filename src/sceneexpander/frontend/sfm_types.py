@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.sparse_points import SparsePoints
+from sceneexpander.ranges import Range, Share, Weight, check_ranges
 
 REFERENCE_LONG_SIDE_PX = 768  # every `_px` threshold below is for images of this long side, and scales with it
+
+
+_Focal = Annotated[float, Range(0.05, 50)]  # over the long side
 
 
 class LearnedUse(StrEnum):
@@ -32,98 +37,125 @@ class SfmConfig:
     """
 
     # Features and matches.
-    max_features: int = 4000  # strongest kept per view
-    contrast_threshold: float = 0.01  # SIFT's default of 0.04 leaves plain rooms with a few hundred features
-    upsample_below_px: int = 700  # images with a shorter long side are enlarged 2x before detection
+    max_features: Annotated[int, Range(1, 1_000_000)] = 4000  # strongest kept per view
+    contrast_threshold: Share = 0.01  # SIFT's default of 0.04 leaves plain rooms with a few hundred features
+    upsample_below_px: Annotated[int, Range(0, 100_000)] = (
+        700  # images with a shorter long side are enlarged 2x before detection
+    )
     equalise: bool = True  # local contrast equalisation (CLAHE) before detection
-    match_ratio: float = 0.87  # nearest / second nearest distance, both directions, of mutual neighbours
-    loose_match_ratio: float = 0.95  # the same for last-chance registration
+    match_ratio: Annotated[float, Range(0, 1, low_open=True)] = (
+        0.87  # nearest / second nearest distance, both directions, of mutual neighbours
+    )
+    loose_match_ratio: Annotated[float, Range(0, 1, low_open=True)] = 0.95  # the same for last-chance registration
     guided: bool = True  # once cameras are known, match all pairs again inside their epipolar bands
-    guided_band_px: float = 2.0
-    guided_ratio: float = 0.85
-    guided_max_distance: float = 0.7  # of unit descriptors
+    guided_band_px: Annotated[float, Range(0, 1000, low_open=True)] = 2.0
+    guided_ratio: Annotated[float, Range(0, 1, low_open=True)] = 0.85
+    guided_max_distance: Annotated[float, Range(0, 2, low_open=True)] = 0.7  # of unit descriptors
 
     learned: LearnedUse = LearnedUse.CHOOSE
-    choose_most_views: int = (
+    choose_most_views: Annotated[int, Range(0, 1_000)] = (
         8  # more views than this are not chosen among: three models of them are dear to make and judge
     )
-    learned_features: int = 2048  # per view
-    learned_long_side_px: int = 1024
-    learned_min_expected: float = 20.0  # matches that must be expected to be right, or two views share nothing
-    learned_candidates: int = (
+    learned_features: Annotated[int, Range(1, 100_000)] = 2048  # per view
+    learned_long_side_px: Annotated[int, Range(64, 8_192)] = 1024
+    learned_min_expected: Weight = 20.0  # matches that must be expected to be right, or two views share nothing
+    learned_candidates: Annotated[int, Range(1, 1_000)] = (
         8  # of each view that SIFT has left out: the others it is matched with, by their descriptors
     )
-    learned_neighbours: int = 4  # of each view that SIFT has connected: the others it is matched with
+    learned_neighbours: Annotated[int, Range(0, 1_000)] = (
+        4  # of each view that SIFT has connected: the others it is matched with
+    )
 
     # Verification of pairs.
-    epipolar_px: float = 1.5  # MAGSAC noise scale for fundamental, essential and homography models
-    min_pair_inliers: int = 15
-    min_pair_inlier_share: float = 0.12
-    rotation_share: float = 0.8  # rotation-only: a pure rotation explains this share of the verified matches
-    rotation_share_free_focal: float = 0.9  # the same at the focal that suits the pair best
-    rotation_px: float = 2.5
+    epipolar_px: Annotated[float, Range(0, 1000, low_open=True)] = (
+        1.5  # MAGSAC noise scale for fundamental, essential and homography models
+    )
+    min_pair_inliers: Annotated[int, Range(8, 1_000_000)] = 15
+    min_pair_inlier_share: Share = 0.12
+    rotation_share: Share = 0.8  # rotation-only: a pure rotation explains this share of the verified matches
+    rotation_share_free_focal: Share = 0.9  # the same at the focal that suits the pair best
+    rotation_px: Annotated[float, Range(0, 1000, low_open=True)] = 2.5
 
     # Focal length, in units of the original's long side.
-    focal_starts: tuple[float, ...] = (0.35, 0.48, 0.62, 0.78, 0.98, 1.25, 1.7, 2.5)
-    focal_bounds: tuple[float, float] = (0.3, 4.0)  # ultra-wide and tele lenses of phones are .36 and 3.3
-    focal_prior: float = 0.85  # phones .7-.75, 35-50 mm lenses 1-1.4, wide lenses .5-.6
-    focal_prior_sigma: float = 0.25  # of the logarithm
-    focal_hint_sigma: float = 0.05  # of the logarithm, around a focal from EXIF
-    focal_hint_penalty: float = 60.0  # observations that another focal must explain beyond those that EXIF's does
-    generated_focal_sigma: float = 0.1  # of the logarithm: a generated picture's focal around that of the photos
-    min_views_for_focal: int = 4  # with fewer views the focal is chosen among the starts and then fixed
-    max_focal_sigma: float = 0.15  # of the logarithm: a focal less certain than this is fixed at its prior
-    focal_doubt_share: float = 0.7  # a view whose lens explains less of the points that it sees is tried with others
-    split_cost: float = 0.7  # a lens of its own must leave at most this share of what the shared one leaves unexplained
-    focal_step: float = 1.2  # between the focals tried for one view
-    split_focal_sigma: float = 0.5  # of the logarithm, around the lens that a view was split from
-    crop_cost: float = 0.85  # the same for a part cut out of a picture of the shared lens: fewer numbers are free
-    lens_rounds: int = 3  # times that lenses are tested and the model is finished again
-    split_penalty: float = 20.0  # observations that a split must bring
+    focal_starts: tuple[_Focal, ...] = (0.35, 0.48, 0.62, 0.78, 0.98, 1.25, 1.7, 2.5)
+    focal_bounds: tuple[_Focal, _Focal] = (0.3, 4.0)  # ultra-wide and tele lenses of phones are .36 and 3.3
+    focal_prior: _Focal = 0.85  # phones .7-.75, 35-50 mm lenses 1-1.4, wide lenses .5-.6
+    focal_prior_sigma: Annotated[float, Range(0, 10, low_open=True)] = 0.25  # of the logarithm
+    focal_hint_sigma: Annotated[float, Range(0, 10, low_open=True)] = 0.05  # of the logarithm, around a focal from EXIF
+    focal_hint_penalty: Weight = 60.0  # observations that another focal must explain beyond those that EXIF's does
+    generated_focal_sigma: Annotated[float, Range(0, 10, low_open=True)] = (
+        0.1  # of the logarithm: a generated picture's focal around that of the photos
+    )
+    min_views_for_focal: Annotated[int, Range(2, 1_000)] = (
+        4  # with fewer views the focal is chosen among the starts and then fixed
+    )
+    max_focal_sigma: Annotated[float, Range(0, 10)] = (
+        0.15  # of the logarithm: a focal less certain than this is fixed at its prior
+    )
+    focal_doubt_share: Share = 0.7  # a view whose lens explains less of the points that it sees is tried with others
+    split_cost: Share = 0.7  # a lens of its own must leave at most this share of what the shared one leaves unexplained
+    focal_step: Annotated[float, Range(1, 10, low_open=True)] = 1.2  # between the focals tried for one view
+    split_focal_sigma: Annotated[float, Range(0, 10, low_open=True)] = (
+        0.5  # of the logarithm, around the lens that a view was split from
+    )
+    crop_cost: Share = 0.85  # the same for a part cut out of a picture of the shared lens: fewer numbers are free
+    lens_rounds: Annotated[int, Range(0, 100)] = 3  # times that lenses are tested and the model is finished again
+    split_penalty: Weight = 20.0  # observations that a split must bring
 
-    distortion_rounds: int = 2  # times that radial distortion is looked for and keypoints are straightened; 0: never
+    distortion_rounds: Annotated[int, Range(0, 100)] = (
+        2  # times that radial distortion is looked for and keypoints are straightened; 0: never
+    )
 
     # Reconstruction.
-    initial_pairs: int = 2  # tried per focal start
-    sweep_tracks: int = 700  # longest tracks used while choosing focal and initial pair; all of them afterwards
-    max_initial_angle_deg: float = 16.0  # wider angles earn an initial pair nothing more
-    min_angle_deg: float = 0.5  # of the widest pair of rays, for a point to be kept
-    register_px: float = 6.0
-    min_register_inliers: int = 15
-    min_register_share: float = 0.25
-    inlier_px: float = 3.0  # reprojection error of an observation that is kept in the end
-    triangulate_px: float = 5.0  # the same while the model grows
-    robust_px: float = 1.0  # Cauchy scale in bundle adjustment, at most; in the end it follows the errors
-    min_robust_px: float = 0.3
-    min_inlier_px: float = 1.2  # the final threshold follows the errors, too, between this and `inlier_px`
-    loose_px: float = 8.0  # last-chance registration (views that match only roughly, such as generated ones)
-    min_loose_inliers: int = 10
-    bundle_iterations: int = 40
+    initial_pairs: Annotated[int, Range(1, 1_000)] = 2  # tried per focal start
+    sweep_tracks: Annotated[int, Range(10, 1_000_000)] = (
+        700  # longest tracks used while choosing focal and initial pair; all of them afterwards
+    )
+    max_initial_angle_deg: Annotated[float, Range(0, 180, low_open=True)] = (
+        16.0  # wider angles earn an initial pair nothing more
+    )
+    min_angle_deg: Annotated[float, Range(0, 90)] = 0.5  # of the widest pair of rays, for a point to be kept
+    register_px: Annotated[float, Range(0, 1000, low_open=True)] = 6.0
+    min_register_inliers: Annotated[int, Range(6, 1_000_000)] = 15
+    min_register_share: Share = 0.25
+    inlier_px: Annotated[float, Range(0, 1000, low_open=True)] = (
+        3.0  # reprojection error of an observation that is kept in the end
+    )
+    triangulate_px: Annotated[float, Range(0, 1000, low_open=True)] = 5.0  # the same while the model grows
+    robust_px: Annotated[float, Range(0, 1000, low_open=True)] = (
+        1.0  # Cauchy scale in bundle adjustment, at most; in the end it follows the errors
+    )
+    min_robust_px: Annotated[float, Range(0, 1000, low_open=True)] = 0.3
+    min_inlier_px: Annotated[float, Range(0, 1000, low_open=True)] = (
+        1.2  # the final threshold follows the errors, too, between this and `inlier_px`
+    )
+    loose_px: Annotated[float, Range(0, 1000, low_open=True)] = (
+        8.0  # last-chance registration (views that match only roughly, such as generated ones)
+    )
+    min_loose_inliers: Annotated[int, Range(6, 1_000_000)] = 10
+    bundle_iterations: Annotated[int, Range(1, 10_000)] = 40
 
     # Evidence that a camera must have.
-    min_agreeing: float = 0.5  # share of a view's verified matches that agree with the model
-    max_rotation_gap_deg: float = (
+    min_agreeing: Share = 0.5  # share of a view's verified matches that agree with the model
+    max_rotation_gap_deg: Annotated[float, Range(0, 180)] = (
         8.0  # between the model's relative rotations and those of single pairs (median over pairs)
     )
-    max_direction_deg: float = (
+    max_direction_deg: Annotated[float, Range(0, 180)] = (
         6.0  # predicted error of directions (standard deviation, median): beyond it a camera is rough
     )
-    max_own_direction_deg: float = (
+    max_own_direction_deg: Annotated[float, Range(0, 180)] = (
         1.0  # the same for a view whose focal only the pictures tell: beyond it it is left out
     )
     refine_known_poses: bool = False  # True: given poses are a start, not the truth
     refine_known_intrinsics: bool = False  # True: a shared factor on the given focals is refined
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         low, high = self.focal_bounds
         if not 0 < low < high:
             raise ValueError(f"focal_bounds must satisfy 0 < low < high, is {self.focal_bounds}")
         if not self.focal_starts or any(not low <= start <= high for start in self.focal_starts):
             raise ValueError(f"focal_starts {self.focal_starts} must lie inside focal_bounds {self.focal_bounds}")
-        if self.min_pair_inliers < 8 or self.min_loose_inliers < 6 or self.min_register_inliers < 6:
-            raise ValueError(
-                "min_pair_inliers must be at least 8, min_register_inliers and min_loose_inliers at least 6"
-            )
         if not 0 < self.match_ratio <= self.loose_match_ratio <= 1:
             raise ValueError(f"0 < match_ratio {self.match_ratio} <= loose_match_ratio {self.loose_match_ratio} <= 1")
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from sceneexpander.errors import UserError
 from sceneexpander.ingest.config import FITS, Fit
+from sceneexpander.ranges import Range, check_ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,14 +24,11 @@ class GeneratorConfig:
 
     backend: str = "replay"
     file: str | None = None
-    count: int = 1
-    candidate: int = 0
+    count: Annotated[int, Range(1, 100)] = 1
+    candidate: Annotated[int, Range(0, 1000)] = 0
     fit: Fit = "crop"
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise UserError(f"must be at least 1, is {self.count}", where="generator.count")
-        if self.candidate < 0:
-            raise UserError(f"must not be negative, is {self.candidate}", where="generator.candidate")
+        check_ranges(self)
         if self.fit not in FITS:
             raise UserError(f"is {self.fit!r}", where="generator.fit", fix=f"use one of: {', '.join(FITS)}")

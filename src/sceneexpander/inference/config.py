@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from sceneexpander.errors import UserError
+from sceneexpander.ranges import Range, check_ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,11 +21,10 @@ class RivalConfig:
     weights: str | None = None
     allow_download: bool = False
     priors: Literal["none", "front_end"] = "none"
-    long_side_px: int = 518  # of the pictures it is given
+    long_side_px: Annotated[int, Range(1, 4096)] = 518  # of the pictures it is given
 
     def __post_init__(self) -> None:
-        if self.long_side_px < 1:
-            raise UserError(f"must be at least 1, is {self.long_side_px}", where="long_side_px")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from sceneexpander.errors import UserError
+from sceneexpander.ranges import Range, check_ranges
 
 Fit = Literal["crop", "pad"]
 FITS: tuple[Fit, ...] = ("crop", "pad")
-# Beyond these a stage would only run out of memory: no reconstructor takes more.
-_LARGEST = {"long_side_px": 4200, "detail_scale": 8, "multiple": 512, "max_views": 1000, "max_megapixels": 1000.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,20 +27,16 @@ class IngestConfig:
         allow_single_view: accept a scene of one photo.
     """
 
-    long_side_px: int = 336
-    detail_scale: int = 2
+    long_side_px: Annotated[int, Range(1, 4096)] = 336
+    detail_scale: Annotated[int, Range(1, 8)] = 2
     fit: Fit = "crop"
-    multiple: int = 14
-    max_views: int = 30
-    max_megapixels: float = 200.0
+    multiple: Annotated[int, Range(1, 256)] = 14
+    max_views: Annotated[int, Range(1, 1000)] = 30
+    max_megapixels: Annotated[float, Range(0, 1000, low_open=True)] = 200.0
     allow_single_view: bool = False
 
     def __post_init__(self) -> None:
-        for name, largest in _LARGEST.items():
-            value = getattr(self, name)
-            if not 0 < value <= largest:
-                problem = f"must be positive, is {value}" if not value > 0 else f"is {value}, more than {largest:g}"
-                raise UserError(problem, where=f"ingest.{name}", fix=f"use at most {largest:g}")
+        check_ranges(self)
         if self.long_side_px % self.multiple:
             lower = max(1, self.long_side_px // self.multiple) * self.multiple
             raise UserError(

@@ -11,12 +11,14 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from sceneexpander.errors import UserError
+from sceneexpander.typed import REFUSALS, shorten
 
 BUILTIN = "builtin"
 HUB_FILE = "model.safetensors"
@@ -51,7 +53,7 @@ def resolve_weights(
     """
     if spec == BUILTIN:
         path = _builtin(model)
-    elif spec.endswith(".safetensors") or Path(spec).exists():
+    elif spec.endswith(".safetensors") or _is_there(Path(spec)):
         path = Path(spec)
     elif HUB_ID.fullmatch(spec):
         path = _from_hub(spec, hub_file, allow_download)
@@ -63,6 +65,21 @@ def resolve_weights(
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return ResolvedWeights(spec=spec, path=path, sha256=digest)
+
+
+def _is_there(path: Path) -> bool:
+    """False, never an error, for names that no file system holds."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise UserError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def _builtin(model: str) -> Path:
@@ -101,12 +118,14 @@ def check_safetensors(path: Path) -> None:
     Raises:
         UserError: missing, a folder, of another format, or truncated.
     """
-    if not path.is_file():
+    if not _is_there(path) or not path.is_file():
         raise UserError(
-            "is not a file" if path.exists() else "does not exist", where=path, fix="check the weights path"
+            "is not a file" if _is_there(path) else "does not exist",
+            where=shorten(str(path), 300),
+            fix="check the weights path",
         )
     total = path.stat().st_size
-    with path.open("rb") as file:
+    with _opened(path) as file:
         start = file.read(8)
         header_bytes = int.from_bytes(start, "little")
         if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
@@ -120,10 +139,15 @@ def check_safetensors(path: Path) -> None:
         raise UserError(problem, where=path, fix="fetch the file again")
     try:
         header = json.loads(raw)
-        end = max(
-            (int(entry["data_offsets"][1]) for name, entry in header.items() if name != "__metadata__"), default=0
-        )
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError):
+        ends = [entry["data_offsets"][1] for name, entry in header.items() if name != "__metadata__"]
+        end = max(ends, default=0)
+        if not all(type(value) is int and value <= total for value in (*ends, end)):
+            raise UserError(
+                f"is truncated or damaged (a tensor ends behind its {total} bytes)",
+                where=path,
+                fix="fetch the file again",
+            )
+    except (*REFUSALS, RecursionError):
         raise UserError(
             "is not a safetensors file (unreadable header)", where=path, fix="fetch the file again"
         ) from None
@@ -141,7 +165,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     check_safetensors(path)
     try:
         return load_file(path)
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, *REFUSALS, OSError) as error:
         raise UserError(f"cannot be read as safetensors ({error})", where=path, fix="fetch the file again") from None
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
-from sceneexpander.artifacts.store import directory_being_written, load_resume_point, save_artifact
+from sceneexpander.artifacts.store import directory_being_written, load_fields, load_resume_point, save_artifact
 
 SCHEMA = "optimisation-checkpoint/1"
 
@@ -35,12 +36,12 @@ class OptimisationCheckpoint:
     @classmethod
     def load(cls, folder: Path, run_key: str) -> OptimisationCheckpoint | None:
         """The checkpoint of this very run, or None if there is none (damaged ones are reported and ignored)."""
-        found = load_resume_point(folder, SCHEMA, run_key)
-        if found is None:
-            return None
-        facts, tensors = found
-        parts: dict[str, dict[str, Tensor]] = {"splats": {}, "density": {}, "cameras": {}}
-        for key, value in tensors.items():
-            part, _, name = key.partition("/")
-            parts[part][name] = value
-        return cls(run_key=run_key, step=facts["step"], losses=facts["losses"], **parts)
+
+        def build(facts: dict[str, Any], tensors: dict[str, Tensor]) -> OptimisationCheckpoint:
+            parts: dict[str, Any] = {"splats": {}, "density": {}, "cameras": {}}
+            for key, value in tensors.items():
+                part, _, name = key.partition("/")
+                parts[part][name] = value
+            return cls(**load_fields(cls, facts, {}, folder, given=tuple(parts)), **parts)
+
+        return load_resume_point(folder, SCHEMA, run_key, build)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from sceneexpander.errors import UserError
+from sceneexpander.ranges import MAX_STEPS, OpenShare, Range, Rate, Share, Steps, Weight, check_ranges
 
+MAX_GAUSSIANS = 50_000_000
 StrategyName = Literal["default", "mcmc"]
 
 
@@ -14,14 +16,18 @@ StrategyName = Literal["default", "mcmc"]
 class RatesConfig:
     """Adam's learning rates. ``means`` is in units of the scene's extent and falls to ``means_final`` geometrically."""
 
-    means: float = 1.6e-4
-    means_final: float = 1.6e-6
-    scales: float = 5e-3
-    rotations: float = 1e-3
-    opacities: float = 5e-2
-    colours: float = 2.5e-3
-    view_colours: float = 1.25e-4  # of the coefficients that depend on the direction
-    poses: float = 0.0  # of the cameras, rotation in radians and translation in extents; falls like that of the means; 0: cameras stay
+    means: Rate = 1.6e-4
+    means_final: Rate = 1.6e-6
+    scales: Rate = 5e-3
+    rotations: Rate = 1e-3
+    opacities: Rate = 5e-2
+    colours: Rate = 2.5e-3
+    view_colours: Rate = 1.25e-4  # of the coefficients that depend on the direction
+    # of the cameras, rotation in radians and translation in extents; falls like that of the means; 0: cameras stay
+    poses: Rate = 0.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,49 +38,43 @@ class DensityConfig:
     """
 
     strategy: StrategyName = "default"
-    start: float = 0.0167
-    stop: float = 0.5
-    every: int = 100
-    max_gaussians: int = 1_000_000
-    min_opacity: float = 0.005  # below it a Gaussian is dead
-    gradient: float = (
-        2e-4  # default: of the projected centre, half images per unit loss; above it the place is too coarse
-    )
-    split_above: float = 0.01  # default: extents; larger Gaussians are split, smaller ones cloned
-    prune_above: float = 0.1  # default: extents; larger Gaussians go after the first reset
-    reset_every: int = 3000  # default: steps; 0: opacities are never reset
-    growth: float = 0.05  # mcmc: share of new Gaussians each time
-    noise: float = 5e5  # mcmc: times the learning rate of the means
-    opacity_weight: float = 0.01  # mcmc: of the mean opacity in the loss
-    scale_weight: float = 0.01  # mcmc: of the mean standard deviation in the loss
+    start: Share = 0.0167
+    stop: Share = 0.5
+    every: Annotated[int, Range(1, MAX_STEPS)] = 100
+    max_gaussians: Annotated[int, Range(1, MAX_GAUSSIANS)] = 1_000_000
+    min_opacity: OpenShare = 0.005  # below it a Gaussian is dead
+    # default: of the projected centre, half images per unit loss; above it the place is too coarse
+    gradient: Annotated[float, Range(0, 1000)] = 2e-4
+    # default: extents; larger Gaussians are split, smaller ones cloned
+    split_above: Annotated[float, Range(0, 1000)] = 0.01
+    # default: extents; larger Gaussians go after the first reset
+    prune_above: Annotated[float, Range(0, 1000, low_open=True)] = 0.1
+    reset_every: Steps = 3000  # default: steps; 0: opacities are never reset
+    growth: Annotated[float, Range(0, 10)] = 0.05  # mcmc: share of new Gaussians each time
+    noise: Annotated[float, Range(0, 1e9)] = 5e5  # mcmc: times the learning rate of the means
+    opacity_weight: Weight = 0.01  # mcmc: of the mean opacity in the loss
+    scale_weight: Weight = 0.01  # mcmc: of the mean standard deviation in the loss
 
     def __post_init__(self) -> None:
-        if not 0 <= self.start <= self.stop <= 1:
-            raise UserError(f"needs 0 <= start <= stop <= 1, is {self.start}, {self.stop}", where="start")
-        if self.every < 1 or self.max_gaussians < 1:
-            raise UserError("every and max_gaussians must be at least 1", where="every")
-        if not 0 < self.min_opacity < 1:
-            raise UserError(f"must be within (0, 1), is {self.min_opacity}", where="min_opacity")
+        check_ranges(self)
+        if self.start > self.stop:
+            raise UserError(f"is {self.start}, must be at most stop ({self.stop})", where="start")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimiseConfig:
     """One optimisation. Views take turns in random order, one per step."""
 
-    steps: int = 7000  # a quarter of what 3DGS takes for hundreds of views
-    repeats: int = 1  # runs with different seeds; with more than one, tables show mean and spread
-    start_gaussians: int = 1_000_000  # at most so many of the reconstruction's are kept, drawn at random and enlarged
-    sh_degree: int = 3  # of the colours; rises by one each thirtieth of the steps
-    ssim_weight: float = 0.2  # of 1 - SSIM beside the mean absolute error
-    checkpoint_every: int = 200  # steps
+    steps: Annotated[int, Range(1, MAX_STEPS)] = 7000  # a quarter of what 3DGS takes for hundreds of views
+    # runs with different seeds; with more than one, tables show mean and spread
+    repeats: Annotated[int, Range(1, 1000)] = 1
+    # at most so many of the reconstruction's are kept, drawn at random and enlarged
+    start_gaussians: Annotated[int, Range(1, MAX_GAUSSIANS)] = 1_000_000
+    sh_degree: Annotated[int, Range(0, 3)] = 3  # of the colours; rises by one each thirtieth of the steps
+    ssim_weight: Share = 0.2  # of 1 - SSIM beside the mean absolute error
+    checkpoint_every: Annotated[int, Range(1, MAX_STEPS)] = 200  # steps
     rates: RatesConfig = field(default_factory=RatesConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
 
     def __post_init__(self) -> None:
-        for name in ("steps", "repeats", "start_gaussians", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise UserError(f"must be at least 1, is {getattr(self, name)}", where=name)
-        if not 0 <= self.sh_degree <= 3:
-            raise UserError(f"must be 0 to 3, is {self.sh_degree}", where="sh_degree")
-        if not 0 <= self.ssim_weight <= 1:
-            raise UserError(f"must be within [0, 1], is {self.ssim_weight}", where="ssim_weight")
+        check_ranges(self)

@@ -172,7 +172,8 @@ class _Run:
     def _set_mean_rate(self, step: int) -> float:
         rates = self._config.rates
         share = (step - 1) / max(self._config.steps - 1, 1)
-        rate = self._extent * rates.means * (rates.means_final / rates.means) ** share
+        fallen = (rates.means_final / rates.means) ** share if rates.means else 0.0
+        rate = self._extent * rates.means * fallen
         self.splats.optimisers["means"].param_groups[0]["lr"] = rate
         return rate
 

@@ -17,12 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.errors import UserError
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.optimisation.config import RatesConfig
 from sceneexpander.optimisation.optimise import photometric_loss, scene_extent
 from sceneexpander.optimisation.splats import Splats
+from sceneexpander.ranges import Rate, Share, Steps, check_ranges
 from sceneexpander.splatting import rasterise
 
 _LAST_RATE = 0.05  # of the first, reached along a cosine
@@ -32,22 +32,16 @@ _LAST_RATE = 0.05  # of the first, reached along a cosine
 class RefineConfig:
     """How long and how fast. Rates are Adam's; that of the means is in units of the scene's extent."""
 
-    steps: int = 0  # one view each; 0: the Gaussians stay as the model made them
-    means: float = 3.2e-4
-    scales: float = 1e-2
-    rotations: float = 1e-3
-    opacities: float = 0.1
-    colours: float = 1e-2
-    ssim_weight: float = 0.2  # of 1 - SSIM beside the mean absolute error
+    steps: Steps = 0  # one view each; 0: the Gaussians stay as the model made them
+    means: Rate = 3.2e-4
+    scales: Rate = 1e-2
+    rotations: Rate = 1e-3
+    opacities: Rate = 0.1
+    colours: Rate = 1e-2
+    ssim_weight: Share = 0.2  # of 1 - SSIM beside the mean absolute error
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise UserError(f"must be at least 0, is {self.steps}", where="steps")
-        for name in ("means", "scales", "rotations", "opacities", "colours"):
-            if getattr(self, name) < 0:
-                raise UserError(f"must be at least 0, is {getattr(self, name)}", where=name)
-        if not 0 <= self.ssim_weight <= 1:
-            raise UserError(f"must be within [0, 1], is {self.ssim_weight}", where="ssim_weight")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,6 +23,7 @@ from sceneexpander.models.mini.inputs import (
 from sceneexpander.models.mini.pairs import CROSS_VIEW_CHANNELS, PairGeometry
 from sceneexpander.models.protocol import ALL_HEADS, Head, Reconstructor
 from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
+from sceneexpander.typed import shorten
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +54,9 @@ def planned_model(name: str) -> PlannedModel:
             build=Mini, prepared=_mini_input, heads=ALL_HEADS - {Head.GAUSSIANS}, multiple=Mini.size_multiple
         )
     if name not in variants:
-        raise UserError(f"unknown model {name!r}", where="model", fix=did_you_mean(name, [*variants, "mini"]))
+        raise UserError(
+            f"unknown model {shorten(name)!r}", where="model", fix=did_you_mean(shorten(name), [*variants, "mini"])
+        )
     config = variants[name]()
     # How many Gaussians a merge leaves depends on values as well; without it none is lost.
     config = replace(config, gaussian=replace(config.gaussian, merge=False))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from sceneexpander.errors import UserError
+from sceneexpander.ranges import Range, Share, check_ranges
 
+_Place = Annotated[float, Range(-1e9, 1e9)]
 Path = Literal["tour", "orbit", "spiral", "keyframes"]
 
 
@@ -26,12 +27,13 @@ class EyeKey:
     methods they are brought over by the captured cameras.
     """
 
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
+    eye: tuple[_Place, _Place, _Place]
+    target: tuple[_Place, _Place, _Place]
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(value) for value in (*self.eye, *self.target)) or self.eye == self.target:
-            raise UserError(f"eye {self.eye} and target {self.target} must be two finite places", where="keyframes")
+        check_ranges(self)
+        if self.eye == self.target:
+            raise UserError(f"is {self.eye} like the eye, must be another place", where="target")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,32 +59,19 @@ class RenderConfig:
 
     path: Path = "tour"
     keyframes: tuple[ViewKey | EyeKey, ...] = ()
-    orbit_deg: float = 60.0
-    spiral_turns: float = 2.0
-    spiral_radius: float = 0.15
-    frames: int = 96
-    fps: int = 24
-    crf: int = 18
-    scale: float = 1.0
-    stills: int = 6
-    background: float = 0.08
+    orbit_deg: Annotated[float, Range(0, 360, low_open=True)] = 60.0
+    spiral_turns: Annotated[float, Range(0, 20, low_open=True)] = 2.0
+    spiral_radius: Annotated[float, Range(0, 1, low_open=True)] = 0.15
+    frames: Annotated[int, Range(2, 100_000)] = 96
+    fps: Annotated[int, Range(1, 240)] = 24
+    crf: Annotated[int, Range(0, 51)] = 18
+    scale: Annotated[float, Range(0, 8, low_open=True)] = 1.0
+    stills: Annotated[int, Range(1, 1000)] = 6
+    background: Share = 0.08
     antialiased: bool = False
     spz: bool = False
 
     def __post_init__(self) -> None:
-        for name, low in (("frames", 2), ("fps", 1), ("stills", 1)):
-            if getattr(self, name) < low:
-                raise UserError(f"must be >= {low}, is {getattr(self, name)}", where=f"render.{name}")
-        for name, over, high in (
-            ("scale", 0, 8),
-            ("orbit_deg", 0, 360),
-            ("spiral_turns", 0, 20),
-            ("spiral_radius", 0, 1),
-        ):
-            if not over < getattr(self, name) <= high:
-                raise UserError(f"must be within ({over}, {high}], is {getattr(self, name)}", where=f"render.{name}")
-        for name, high in (("background", 1), ("crf", 51)):
-            if not 0 <= getattr(self, name) <= high:
-                raise UserError(f"must be within [0, {high}], is {getattr(self, name)}", where=f"render.{name}")
+        check_ranges(self)
         if self.path == "keyframes" and len(self.keyframes) < 2:
             raise UserError(f"path keyframes needs at least two, has {len(self.keyframes)}", where="render.keyframes")

@@ -8,9 +8,11 @@ scalar-first quaternion; float32, binary little-endian. Provenance follows in tw
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 import numpy as np
 import torch
@@ -22,6 +24,7 @@ from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.splatting.files import complete_file
 from sceneexpander.splatting.scene import check_finite
 
+Linear = Literal["opacity", "scale"]
 ROWS_PER_CHUNK = 65536  # written at once, bounds the memory
 OPACITY_MARGIN = 1e-6  # logits of exactly 0 or 1 would be infinite, which viewers do not expect
 SMALLEST_SCALE = 1e-30
@@ -35,6 +38,11 @@ SCALAR_TYPES = {
 FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 PROVENANCE = ("source_view", "generated")
+COMPRESSED = {"packed_position", "packed_rotation", "packed_scale", "packed_color"}
+MAX_COUNT_DIGITS = 15
+FEWEST_TO_JUDGE = 10  # of fewer Gaussians nobody can say what their numbers mean
+WIDE_OVERLAP = 3.0  # size of the usual Gaussian in distances between neighbours, beyond which a scene would be fog
+_log = logging.getLogger(__name__)
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
@@ -77,14 +85,21 @@ def _write_rows(file: BinaryIO, scene: Gaussians, rows: slice) -> None:
     file.write(floats.data)
 
 
-def read_ply(path: Path) -> Gaussians:
+def read_ply(path: Path, *, linear: Collection[Linear] = ()) -> Gaussians:
     """Read a scene written here or by other 3D Gaussian splatting programs: any property order and numeric type, with or without
     normals, ascii or binary of either byte order; properties that are not ours are ignored.
 
     Without provenance, ``source_view`` is -1 and ``generated`` false.
 
+    Some programs write opacities and scales as they are, and not as logits and logarithms. Nothing in the file says so; the numbers do,
+    mostly: see `_refuse_linear`. Such a file is read when the caller says what it is.
+
+    Args:
+        path: of the file.
+        linear: which quantities are stored as they are.
+
     Raises:
-        UserError: no such file, no PLY, no Gaussians in it, a wrong length, values that are not finite.
+        UserError: no such file, no PLY, no Gaussians in it, a wrong length, values that are not finite, or plainly linear.
     """
     try:
         with path.open("rb") as file:
@@ -92,9 +107,10 @@ def read_ply(path: Path) -> Gaussians:
             table = _read_table(file, header, path)
     except FileNotFoundError:
         raise UserError("does not exist", where=path) from None
-    except (IsADirectoryError, PermissionError) as error:
-        raise UserError(f"cannot be read ({error.strerror})", where=path) from error
-    return _gaussians(table, header, path)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise UserError(f"cannot be read ({reason})", where=str(path)[:300]) from None
+    return _gaussians(table, header, path, frozenset(linear))
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +138,9 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
                 pass
             case ["format", name, "1.0"]:
                 encoding = name
-            case ["element", name, count] if count.isdecimal():
+            case ["element", _, count] if count.isdecimal() and len(count) > MAX_COUNT_DIGITS:
+                raise UserError(f"announces a number of {len(count)} digits of elements", where=path)
+            case ["element", name, count] if count.isascii() and count.isdecimal():
                 elements.append((name, int(count), list[tuple[str, str]]()))
             case ["property", "list", *_] if elements:
                 elements[-1][2].append(("", "list"))
@@ -149,6 +167,9 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
 def _read_table(file: BinaryIO, header: _Header, path: Path) -> NDArray[np.void]:
     """The vertices as a structured array."""
     missing = [name for name in (*FIXED, *ROTATION) if name not in dict(header.properties)]
+    if missing and COMPRESSED & set(dict(header.properties)):
+        fix = "convert it to a plain PLY first, e.g. with splat-transform"
+        raise UserError("is a compressed PLY (SuperSplat), which is not read", where=path, fix=fix)
     if missing:
         raise UserError(f"is not a 3D Gaussian PLY: vertices lack {', '.join(missing)}", where=path)
     order = BYTE_ORDERS.get(header.encoding, "=")
@@ -198,7 +219,42 @@ def _columns(table: NDArray[np.void], wanted: tuple[str, ...]) -> NDArray[np.flo
     return stacked
 
 
-def _gaussians(table: NDArray[np.void], header: _Header, path: Path) -> Gaussians:
+def _refuse_linear(opacities: Tensor, scales: Tensor, means: Tensor, path: Path) -> None:
+    """Refuse opacities and scales that cannot be logits and logarithms; where both are possible, say so and take them for that.
+
+    Logits that all lie within 0 and 1 would mean that every Gaussian is between 50 and 73 % opaque. Logarithms that are all above 0 would
+    mean that every Gaussian is larger than one unit in every direction: possible in a scene of large units, but not where the usual one
+    would then cover many times the distance to its neighbours.
+    """
+    count = len(opacities)
+    if not count or not bool(
+        torch.isfinite(opacities).all() & torch.isfinite(scales).all() & torch.isfinite(means).all()
+    ):
+        return  # refused by row, elsewhere
+    faint = bool((opacities == 0).all())  # as they are: nothing to be seen
+    within = bool(((opacities >= 0) & (opacities <= 1)).all()) and not faint
+    positive = bool((scales > 0).all())
+    sample = means[:: max(1, count // 50_000)].double()
+    spread = sample.quantile(0.95, 0) - sample.quantile(0.05, 0)
+    spacing = float(spread.norm()) / count**0.5
+    foggy = positive and float(scales.double().median().exp()) > WIDE_OVERLAP * spacing
+    found: list[str] = []
+    if within and (positive or count >= FEWEST_TO_JUDGE):
+        found.append("opacities (all within 0 and 1) are no logits")
+    if positive and (foggy if count >= FEWEST_TO_JUDGE else within):
+        found.append("scales (all above 0) are no logarithms")
+    if found:
+        raise UserError(
+            f"holds linear values: its {' and its '.join(found)}",
+            where=path,
+            fix="write it as other 3D Gaussian splatting programs do, or read it with linear=...",
+        )
+    if within or positive:
+        what = "opacities lie within 0 and 1" if within else "scales are above 0"
+        _log.warning("%s: all %s; taken for %s", path, what, "logits" if within else "logarithms")
+
+
+def _gaussians(table: NDArray[np.void], header: _Header, path: Path, linear: frozenset[Linear]) -> Gaussians:
     names = table.dtype.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in REST_COUNTS or any(f"f_rest_{i}" not in names for i in range(rest)):
@@ -209,12 +265,26 @@ def _gaussians(table: NDArray[np.void], header: _Header, path: Path) -> Gaussian
 
     higher = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(len(table), 3, rest // 3).transpose(1, 2)
     unknown = np.full(len(table), -1, np.int64)
+    if "source_view" in names and not np.isfinite(table["source_view"]).all():
+        raise UserError("has a source_view that is no number", where=path)
     source_view = table["source_view"].astype(np.int64) if "source_view" in names else unknown
+    means, opacities, scales = (
+        columns("x", "y", "z"),
+        columns("opacity")[:, 0],
+        columns("scale_0", "scale_1", "scale_2"),
+    )
+    # What was written here says so by its provenance.
+    if not linear and not set(PROVENANCE) <= set(names):
+        _refuse_linear(opacities, scales, means, path)
+    if "opacity" in linear and not bool(((opacities >= 0) & (opacities <= 1)).all()):
+        raise UserError("has opacities outside 0 to 1: they are not linear", where=path)
+    if "scale" in linear and not bool((scales > 0).all()):
+        raise UserError("has scales that are not above 0: they are not linear", where=path)
     scene = Gaussians(
-        means=columns("x", "y", "z"),
+        means=means,
         quat_wxyz=columns(*ROTATION),
-        scales=columns("scale_0", "scale_1", "scale_2").exp(),
-        opacities=columns("opacity")[:, 0].sigmoid(),
+        scales=scales if "scale" in linear else scales.exp(),
+        opacities=opacities if "opacity" in linear else opacities.sigmoid(),
         sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], higher], 1),
         source_view=torch.from_numpy(source_view),
         generated=torch.from_numpy(table["generated"] != 0 if "generated" in names else np.zeros(len(table), bool)),

@@ -41,7 +41,9 @@ SCALE_OFFSET, SCALE_STEPS = 10.0, 16.0  # a byte of scale is steps * (log(scale)
 SH_GAIN = 128.0  # a byte of a higher harmonic is 128 * (1 + coefficient)
 SH_STEPS = {1: 8, 2: 16, 3: 16}  # by degree: bytes are rounded to multiples, which compress well
 ROTATION_BITS = 9  # of a component's size, beside its sign
-WORST_RATIO = 1100  # gzip cannot compress better: a file that claims more is damaged
+# Real scenes come to a third or half of their size, equal Gaussians to a hundredth; gzip itself reaches a thousandth, and a file of a
+# megabyte would become gigabytes in memory.
+WORST_RATIO, SMALL_BYTES = 50, 64 << 20
 _ROTATION_BYTES = {2: 3, 3: 4}
 
 
@@ -91,8 +93,9 @@ def read_spz(path: Path) -> Gaussians:
         raw = path.read_bytes()
     except FileNotFoundError:
         raise UserError("does not exist", where=path) from None
-    except (IsADirectoryError, PermissionError) as error:
-        raise UserError(f"cannot be read ({error.strerror})", where=path) from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise UserError(f"cannot be read ({reason})", where=str(path)[:300]) from None
     version, count, degree, bits, body = _unpack(raw, path)
     at = 0
 
@@ -123,6 +126,10 @@ def read_spz(path: Path) -> Gaussians:
 
 def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, NDArray[np.uint8]]:
     """(version, count, degree, fractional bits, everything after the header); never inflates more than the header announces."""
+    if raw[:4] == MAGIC.to_bytes(4, "little"):  # the header of versions before is compressed like the rest
+        version = int.from_bytes(raw[4:8], "little")
+        fix = "write it as version 3 or as PLY, e.g. with splat-transform"
+        raise UserError(f"is SPZ {version}, which is not read here: versions 2 and 3 are", where=path, fix=fix)
     inflate = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         head = inflate.decompress(raw, HEADER.size)
@@ -136,14 +143,20 @@ def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, NDArray[np.uint
         if degree > 3 or bits > MOST_FRACTIONAL_BITS:
             raise UserError(f"has SH degree {degree} and {bits} fractional bits, at most 3 and 23 exist", where=path)
         expected = count * (9 + 1 + 3 + 3 + _ROTATION_BYTES[version] + 3 * ((degree + 1) ** 2 - 1))
-        if expected > WORST_RATIO * len(raw):
-            raise UserError(f"is truncated: no file of {len(raw)} bytes holds {count} Gaussians", where=path)
+        if expected > max(SMALL_BYTES, WORST_RATIO * len(raw)):
+            raise UserError(f"announces {count} Gaussians, too many for a file of {len(raw)} bytes", where=path)
         body = inflate.decompress(inflate.unconsumed_tail, expected + 1)
+        if not inflate.eof:
+            inflate.decompress(inflate.unconsumed_tail, 1)  # to the end of the stream, where its check sum is
     except zlib.error:
         raise UserError("is not an SPZ file (not compressed with gzip, or damaged)", where=path) from None
     if len(body) != expected:
         found = "more" if len(body) > expected else str(len(body))
         raise UserError(f"announces {count} Gaussians in {expected} bytes and holds {found}", where=path)
+    if not inflate.eof:
+        raise UserError("is truncated: its check sum is missing", where=path)
+    if inflate.unused_data:
+        raise UserError(f"holds {len(inflate.unused_data)} bytes behind its end", where=path)
     return version, count, degree, bits, np.frombuffer(body, np.uint8)
 
 

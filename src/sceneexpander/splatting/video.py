@@ -18,6 +18,9 @@ from sceneexpander.splatting.files import complete_file
 BT709 = 1  # code of ITU-R BT.709 for colour matrix, primaries and transfer in video streams
 LIMITED_RANGE = 1
 GENERATED_TINT = (1.0, 0.45, 0.05)
+# The same frames are to give the same bytes. x264's macroblock tree reads memory that nobody wrote (seen on AVX-512: other bytes each
+# time, pixels up to 54 levels apart), and what several threads make depends on their number, which would be that of the cores.
+REPEATABLE = {"x264-params": "mbtree=0", "threads": "1"}
 SMALLEST_SPREAD = 1e-6  # relative, of depths that still get more than one colour
 
 
@@ -60,7 +63,7 @@ class VideoEncoder:
         stream = self._stream
         stream.height, stream.width = height, width
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": str(self._crf), "preset": "medium"}
+        stream.options = {"crf": str(self._crf), "preset": "medium", **REPEATABLE}
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = BT709
         context.color_range = LIMITED_RANGE
@@ -68,7 +71,7 @@ class VideoEncoder:
 
 @contextlib.contextmanager
 def open_video(path: Path, fps: float, *, crf: int = 18) -> Iterator[VideoEncoder]:
-    """An H.264 file (yuv420p, BT.709, faststart MP4) that takes frames as they come.
+    """An H.264 file (yuv420p, BT.709, faststart MP4) that takes frames as they come; the same frames give the same bytes.
 
     It appears at the end of the context, complete; after an error nothing is left behind, and an older file stays.
 

@@ -13,6 +13,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.errors import UserError, entry_point
+from sceneexpander.viewer.gate import check_authority
 from sceneexpander.viewer.live import HOST, LiveViewer
 
 METHODS = (  # the last one that exists is shown first
@@ -27,6 +28,7 @@ METHODS = (  # the last one that exists is shown first
     "sceneexpander",
 )
 LIMIT = 400_000
+LAST_PORT = 64_535  # a thousand below the end: the next free one is taken if it is in use
 
 
 def load_round(folder: Path, number: int) -> tuple[str, list[Reconstruction], dict[str, Tensor]]:
@@ -66,11 +68,21 @@ def main() -> None:
     parser.add_argument("--round", type=int, default=1)
     parser.add_argument("--port", type=int, default=8080)
     parser.add_argument("--limit", type=int, default=LIMIT, help="Gaussians per method; fewer for a weak machine")
+    parser.add_argument(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME[:PORT]",
+        help="answer to this name too, as the address bar shows it behind a tunnel or a proxy; may be repeated",
+    )
     arguments = parser.parse_args()
     if arguments.limit < 1:
         raise UserError(f"must be at least 1, is {arguments.limit}", where="--limit")
+    if not 0 <= arguments.port <= LAST_PORT:
+        raise UserError(f"is {arguments.port}, must be from 0 to {LAST_PORT}", where="--port")
+    hosts = [check_authority(name) for name in arguments.allow_host]
     title, reconstructions, pictures = load_round(arguments.folder, arguments.round)
-    viewer = LiveViewer(reconstructions, pictures, title=title, port=arguments.port, limit=arguments.limit)
+    viewer = LiveViewer(reconstructions, pictures, title=title, port=arguments.port, limit=arguments.limit, hosts=hosts)
     print(f"viewer: http://{HOST}:{viewer.port} (stop with Ctrl-C)", flush=True)
     try:
         viewer.serve()

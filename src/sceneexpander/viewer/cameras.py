@@ -21,11 +21,11 @@ class Cameras:
     """The cameras of a reconstruction, in its own world frame (OpenCV axes, scene units)."""
 
     view_ids: tuple[str, ...]
-    generated: Bool[Tensor, view]
-    posed: Bool[Tensor, view]
+    generated: Bool[Tensor, " view"]
+    posed: Bool[Tensor, " view"]
     world_from_cam: Float[Tensor, "view 4 4"]
     intrinsics_px: Float[Tensor, "view 3 3"]
-    focus: Float[Tensor, view]  # median z-depth around the middle of the view, what one turns around
+    focus: Float[Tensor, " view"]  # median z-depth around the middle of the view, what one turns around
     height: int
     width: int
 

@@ -17,6 +17,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.viewer.cameras import Cameras, alignment, frustum_length, up_direction
+from sceneexpander.viewer.gate import check_authority, gate
 from sceneexpander.viewer.packed import visible_weight
 from sceneexpander.viewer.viser_axes import enlargement, viser_camera, viser_picture, viser_splats, widened
 
@@ -77,9 +78,10 @@ class LiveViewer:
         title: name in the browser's tab.
         port: to listen on; the next free one is taken if it is in use.
         limit: Gaussians to show per method at most, the most visible ones.
+        hosts: names (``NAME`` or ``NAME:PORT``) it answers to besides the loopback ones with its own port, for tunnels and proxies.
 
     Raises:
-        UserError: viser is not installed.
+        UserError: viser is not installed, or something among ``hosts`` is no such name.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class LiveViewer:
         title: str,
         port: int = 8080,
         limit: int,
+        hosts: Sequence[str] = (),
     ) -> None:
         if not reconstructions:
             raise ValueError("nothing to show")
@@ -107,7 +110,8 @@ class LiveViewer:
             method=names[-1], before=names[-2] if len(names) > 1 else None, eye=viser_camera(main, 0).position
         )
         self._totals = {item.method: len(item.gaussians) for item in reconstructions}
-        self._server: Any = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
+        with gate([check_authority(host) for host in hosts]):
+            self._server: Any = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
         self._length = frustum_length(main)
         # The share button would open a tunnel to a server elsewhere.
         self._server.gui.configure_theme(

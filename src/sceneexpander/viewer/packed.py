@@ -32,7 +32,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.store import ArtifactError, load_artifact, require_tensor, save_artifact
+from sceneexpander.artifacts.store import load_artifact, load_fields, refusing, save_artifact
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.splatting import rasterise, render
@@ -90,18 +90,12 @@ class PackedSplats:
     def load(cls, folder: Path) -> PackedSplats:
         """Read what `save` wrote. Raises `ArtifactError` for a damaged or invalid artefact."""
         facts, tensors = load_artifact(folder, SCHEMA)
-        cameras = Cameras(
-            view_ids=tuple(facts["view_ids"]),
-            height=facts["height"],
-            width=facts["width"],
-            **{name: require_tensor(tensors, name, folder) for name in _CAMERA_TENSORS},
-        )
-        values = {name: facts[name] for name in _FACTS}
-        values["origin"] = tuple(facts["origin"])
-        try:
-            return cls(cameras=cameras, data=require_tensor(tensors, "data", folder), **values)
-        except ValueError as error:
-            raise ArtifactError(f"is invalid ({error})", where=folder, fix="rerun the stage that makes it") from None
+        of_cameras: dict[str, object] = {
+            name: facts.pop(name) for name in ("view_ids", "height", "width") if name in facts
+        }
+        with refusing(folder):
+            cameras = Cameras(**load_fields(Cameras, of_cameras, tensors, folder))
+            return cls(cameras=cameras, **load_fields(cls, facts, tensors, folder, given=("cameras",)))
 
 
 def visible_weight(reconstruction: Reconstruction, *, device: torch.device | str = "cpu") -> Float[Tensor, " gaussian"]:

@@ -135,7 +135,7 @@ def test_the_gpu_profile_with_worldmirror_has_the_papers_values() -> None:
         ("ablation=ancor", "ablation: has no option 'ancor'; did you mean 'anchor'?"),
         ("adpt=default", "adpt: unknown key; did you mean 'adapt'?"),
         ("adapt.steps=many", "adapt.steps: is 'many' (str), expected a whole number"),
-        ("adapt.steps=-1", "adapt: adapt.steps must be >= 0, is -1"),
+        ("adapt.steps=-1", "adapt.steps: is -1, must be from 0 to 1000000"),
         ("+adapt.extra=1", "adapt.extra: unknown key"),
         ("scene.fit=stretch", "scene.fit: is 'stretch'; known: crop, pad"),
         ("render.path=obrit", "render.path: is 'obrit'; did you mean 'orbit'?"),
@@ -153,6 +153,82 @@ def test_a_typo_is_one_line_with_a_suggestion(override: str, message: str) -> No
     with pytest.raises(ConfigError) as caught:
         compose(CONF, [override])
     assert caught.value.line().startswith(message)
+
+
+D = "9" * 10_000
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        # A group without this option, optional or not; in place of an option, what is none.
+        ("experiment=papr_table", "experiment: has no option 'papr_table'; did you mean 'paper_table'?"),
+        ("experiment=[paper_table, nope]", "experiment: has no option '[paper_table, nope]'"),
+        ("hydra/launcher=nope", "hydra/launcher: has no option 'nope'; known: parallel, serial, slurm"),
+        ("model=../model/mini", "model: has no option '../model/mini'"),
+        ("adapt=null", "adapt: has no option 'null'; known: default"),
+        ("adapt=[1]", "adapt: has no option '[1]'; known: default"),
+        ("adapt={}", "adapt: has no option '{}'; known: default"),
+        ("adapt=3", "adapt: has no option '3'; known: default"),
+        ("~adapt", "adapt."),
+        (f"model={'x' * 5000}", "model: has no option 'xxx"),
+        # Keys and values of any length and depth.
+        ("x" * 100_000 + "=1", "xxx"),
+        ("adapt." + "x" * 100_000 + "=1", "adapt.xxx"),
+        ("adapt." + ".".join("x" * 90) + "=1", "adapt.x.x"),
+        (f"generator.file={'x' * 30_000}", "generator.file: has 30015 characters"),
+        (f"adapt.steps={D}", "adapt.steps: is no KEY=VALUE (a number of too many digits)"),
+        (f"adapt.learning_rate={D}", "adapt.learning_rate: is no KEY=VALUE (a number of too many digits)"),
+        (
+            "seed=1" + "0" * 4000,
+            "seed: is a whole number of more than 40 digits, must be from 0 to 9223372036854775807",
+        ),
+        ("seed=9223372036854775808", "seed: is 9223372036854775808, must be from 0 to 9223372036854775807"),
+        ("adapt.steps=" + "[" * 900 + "]" * 900, "adapt.steps: is nested too deeply"),
+        # No override at all, and values that Hydra does not understand.
+        ("adapt", "adapt: is not KEY=VALUE"),
+        ("=", "=: is not KEY=VALUE"),
+        ("adapt.steps='", "adapt.steps: is no KEY=VALUE"),
+        ("adapt.steps=1,2", "adapt.steps: holds several values; give one"),
+        ("adapt.steps=${adapt.steps}", "adapt.steps: cannot be set (Recursive interpolation"),
+        ("adapt.augment=[1]", "adapt.augment: cannot be set"),
+        # Whole numbers.
+        ("adapt.steps=1.5", "adapt.steps: is 1.5 (float), expected a whole number"),
+        ("adapt.steps=1e300", "adapt.steps: is a whole number of more than 40 digits"),
+        ("adapt.steps=1e999", "adapt.steps: is inf, expected a finite number"),
+        ("threads=1000", "threads: is 1000, must be from 0 to 256"),
+        ("device=cudaX", "device: is 'cudaX'; use cpu, cuda or cuda:N"),
+        ("device=cuda:", "device: is 'cuda:'; use cpu, cuda or cuda:N"),
+    ],
+    ids=lambda text: text[:30],
+)
+def test_whatever_stands_there_is_one_short_line(override: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        compose(CONF, [override])
+    assert caught.value.line().startswith(message)
+    assert len(caught.value.line()) < 400
+
+
+def test_an_optional_group_may_be_asked_for_nothing() -> None:
+    assert composed("experiment=null") == composed()
+    assert composed("experiment=paper_table") != composed()
+
+
+def test_whole_numbers_may_be_written_as_powers_of_ten() -> None:
+    values = composed("adapt.steps=1e2", "adapt.close_gaps=1")
+    assert (values["adapt"]["steps"], values["adapt"]["close_gaps"]) == (100, 1.0)
+    # As it is kept, too: one value has one key in the cache.
+    assert [type(values["adapt"][name]) for name in ("steps", "close_gaps")] == [int, float]
+
+
+@pytest.mark.parametrize("text", ["a: [", "\x00", "a: 1\n b: 2", "- 1", "3", "a: {b: !!python/name:os.system }"])
+def test_a_malformed_option_of_ones_own_is_one_line(tmp_path: Path, text: str) -> None:
+    conf = tmp_path / "conf"
+    shutil.copytree(CONF, conf)
+    (conf / "render" / "flight.yaml").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        compose(conf, ["render=flight"])
+    assert len(caught.value.line()) < 400
 
 
 def test_key_frames_come_from_an_override_or_from_a_file_of_ones_own(tmp_path: Path) -> None:

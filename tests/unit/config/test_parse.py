@@ -2,10 +2,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 
+from sceneexpander.config.files import read_yaml
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.errors import UserError
 
@@ -71,7 +73,7 @@ def test_every_kind_of_field() -> None:
     [
         ({"stepz": 3}, "stepz: unknown key; did you mean 'steps'?"),
         ({"inner": {"rat": 1}}, "inner.rat: unknown key; did you mean 'rate'?"),
-        ({"steps": 3.0}, "steps: is 3.0 (float), expected a whole number"),
+        ({"steps": 3.5}, "steps: is 3.5 (float), expected a whole number"),
         ({"steps": True}, "steps: is True (bool), expected a whole number"),
         ({"steps": "3"}, "steps: is '3' (str), expected a whole number"),
         ({"flag": 1}, "flag: is 1 (int), expected true or false"),
@@ -112,3 +114,34 @@ def test_a_rooms_own_message_gets_the_section_that_holds_it() -> None:
     with pytest.raises(ConfigError) as caught:
         parse_dataclass(Room, {"side": 1}, where="scene")
     assert caught.value.line() == "scene.side: is odd; use 2"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("a: 1\na: 2", "has 'a' twice"),
+        ("a:\n  b: 1\n  c: 2\n  b: 1", "has 'b' twice"),
+        ("a: 2020-13-45", "is not valid YAML"),
+        ("a: " + "9" * 5000, "is not valid YAML"),
+        ("a: " + "[" * 20_000, "is nested too deeply"),
+        ("a: [", "is not valid YAML"),
+        ("a: !!python/object/apply:os.system [ls]", "is not valid YAML"),
+        (b"\xff\xfea\x00:\x00", "is not valid YAML"),
+        (b"a: \xff", "is not valid YAML"),
+        (b"a: \x00", "is not valid YAML"),
+    ],
+    ids=lambda item: item[:20],
+)
+def test_a_damaged_file_is_one_line(tmp_path: Path, text: str | bytes, problem: str) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigError) as caught:
+        read_yaml(path)
+    assert problem in caught.value.line()
+    assert len(caught.value.line()) < 400
+
+
+def test_a_path_that_is_no_file_is_one_line(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / ("x" * 300), tmp_path / "nothing"):
+        with pytest.raises(ConfigError):
+            read_yaml(path)

@@ -165,3 +165,32 @@ def test_comparison_measures_in_units_of_the_tolerance() -> None:
     assert compare_tensors("x", expected, expected, atol=0.0, rtol=0.0).ok
     assert not compare_tensors("x", expected + 1e-6, expected, atol=0.0, rtol=0.0).ok
     assert not OutputCheck(name="x", error=math.nan, tolerance=1.0).ok
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, '{"a":' * 50_000, "9" * 5000, '{"a": [[' + "9" * 5000 + '], "f"]}', '{"a": [[1e400], "f"]}', '{"a": [["1"], "f"]}',
+     '{"a": [[NaN], "f"]}', '{"a": 3}', '{"a": [[-1], "f"]}', "[]", "", "\x00"],
+    ids=lambda text: text[:20],
+)  # fmt: skip
+def test_a_key_list_that_is_none_is_one_line(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.keys.json"
+    path.write_text(text)
+    with pytest.raises(SystemExit) as stop:
+        main(["--keys", str(path)])
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert str(path) in said
+    assert said.count("\n") == 1
+    assert len(said) < 500
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "x" * 300, "a\0b", "nothing", "/dev/zero"])
+@pytest.mark.parametrize("option", [[], ["--keys"]])
+def test_a_name_that_is_no_case_is_one_line(
+    name: str, option: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*option, str(tmp_path / name)])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import math
+import os
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +20,7 @@ from sceneexpander.artifacts.metrics import TruthMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError, sha256_of_file
 from sceneexpander.artifacts.views import ViewSet
-from sceneexpander.evaluation import SceneTruth, ViewTruth, against_truth, load_truth
+from sceneexpander.evaluation import SceneTruth, ViewTruth, against_truth, check_truth, load_truth
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from tests.unit.evaluation.made import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
@@ -211,9 +215,128 @@ def test_truth_folder(tmp_path: Path) -> None:
     )
     for damage in damages:
         path.write_text(json.dumps({**content, **damage}))
-        with pytest.raises(ArtifactError, match="is invalid"):
+        with pytest.raises(ArtifactError, match=r"is invalid|is not valid|is not there"):
             load_truth(tmp_path)
     path.write_text(json.dumps(content))
     Image.fromarray(mask).save(tmp_path / "truth" / "depth" / "a.png")
     with pytest.raises(ArtifactError, match="not a 16-bit"):
         load_truth(tmp_path)
+
+
+def truth_folder(root: Path) -> tuple[Path, dict[str, Any]]:
+    """(cameras.json, its content) of a scene of one photo with a depth map."""
+    for part in ("captured", "truth/depth"):
+        (root / part).mkdir(parents=True)
+    Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(root / "captured" / "a.png")
+    Image.fromarray(np.full((4, 6), 1500, np.uint16)).save(root / "truth" / "depth" / "a.png")
+    camera = {"file": "captured/a.png", "world_from_cam": np.eye(4).tolist()}
+    content = {"note": "one's own", "intrinsics_px": np.eye(3).tolist(), "captured": [camera]}
+    path = root / "truth" / "cameras.json"
+    path.write_text(json.dumps(content))
+    assert load_truth(root) is not None
+    return path, content
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"[]",
+        b"3",
+        b"null",
+        b"{",
+        b"{}",
+        b"\xff\xfe{\x00}\x00",
+        b"[" * 100_000,
+        b'{"a":' * 50_000,
+        b'{"a": ' + b"9" * 5000 + b"}",
+    ],
+    ids=lambda text: repr(text[:12]),
+)
+def test_a_file_that_is_no_truth_is_one_line(tmp_path: Path, text: bytes) -> None:
+    path, _ = truth_folder(tmp_path)
+    path.write_bytes(text)
+    with pytest.raises(ArtifactError, match=r"cameras\.json: "):
+        load_truth(tmp_path)
+
+
+NAN_POSE = [[math.nan, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("file", "../outside.png"), ("file", "captured/../../outside.png"), ("file", "/etc/hostname"), ("file", ""), ("file", "captured"),
+        ("file", "captured/none.png"), ("file", "a\0b"), ("file", "x" * 5000), ("file", "\ud800.png"), ("file", 3), ("file", None),
+        ("world_from_cam", NAN_POSE), ("world_from_cam", np.zeros((4, 4)).tolist()), ("world_from_cam", (2 * np.eye(4)).tolist()),
+        ("world_from_cam", np.diag([1, 1, -1, 1]).tolist()), ("world_from_cam", np.eye(3).tolist()), ("world_from_cam", "x"),
+        ("world_from_cam", [["1", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        ("world_from_cam", (1e99 * np.ones((4, 4))).tolist()),
+    ],
+    ids=lambda item: str(item)[:20].encode("unicode_escape").decode(),
+)  # fmt: skip
+def test_cameras_that_are_none_are_named(tmp_path: Path, key: str, value: object) -> None:
+    (tmp_path / "outside.png").write_bytes(b"x")
+    scene = tmp_path / "scene"
+    path, content = truth_folder(scene)
+    path.write_text(json.dumps({**content, "captured": [{**content["captured"][0], key: value}]}))
+    with pytest.raises(ArtifactError, match=r"cameras\.json: ") as caught:
+        load_truth(scene)
+    assert len(caught.value.line()) < 500 + len(str(path))
+
+
+@pytest.mark.parametrize(
+    "intrinsics", [np.zeros((3, 3)).tolist(), (-np.eye(3)).tolist(), [1, 2], None, [[math.inf] * 3] * 3]
+)
+def test_intrinsics_that_are_none_are_refused(tmp_path: Path, intrinsics: object) -> None:
+    path, content = truth_folder(tmp_path)
+    path.write_text(json.dumps({**content, "intrinsics_px": intrinsics}))
+    with pytest.raises(ArtifactError, match=r"cameras\.json: "):
+        load_truth(tmp_path)
+
+
+def damaged_pngs() -> dict[str, bytes]:
+    stream = io.BytesIO()
+    Image.fromarray(np.arange(24, dtype=np.uint16).reshape(4, 6)).save(stream, format="PNG")
+    good = stream.getvalue()
+    chunks = {f"byte {at}": good[:at] + bytes([good[at] ^ 0xFF]) + good[at + 1 :] for at in range(8, len(good), 3)}
+    return {"empty": b"", "cut": good[: len(good) // 2], "text": b"no picture", **chunks}
+
+
+def test_damaged_maps_are_refused_or_read(tmp_path: Path) -> None:
+    truth_folder(tmp_path)
+    refused = 0
+    for name, data in damaged_pngs().items():
+        (tmp_path / "truth" / "depth" / "a.png").write_bytes(data)
+        try:
+            load_truth(tmp_path)
+        except ArtifactError as error:
+            refused += 1
+            assert "a.png" in error.line(), name  # noqa: PT017
+    assert refused > 10
+
+
+def test_something_else_in_place_of_the_files_is_one_line(tmp_path: Path) -> None:
+    for number, place in enumerate(("truth/cameras.json", "truth/depth/a.png", "captured/a.png")):
+        for make in (Path.mkdir, os.mkfifo, lambda path: path.symlink_to(path)):
+            scene = tmp_path / f"{number}{make}"[:12]
+            truth_folder(scene)
+            (scene / place).unlink()
+            make(scene / place)
+            with pytest.raises(ArtifactError):
+                load_truth(scene)
+            shutil.rmtree(scene)
+
+
+def test_maps_of_another_size_are_found_before_anything_runs(tmp_path: Path) -> None:
+    truth_folder(tmp_path)
+    scene = made_reconstruction()
+    record = dataclasses.replace(
+        own_pictures(scene).records[0],
+        sha256=sha256_of_file(tmp_path / "captured" / "a.png"),
+        original_height=4,
+        original_width=6,
+    )
+    check_truth(tmp_path, [record])
+    with pytest.raises(ArtifactError, match="truth of 4 x 6 pixels for a picture of 4 x 7"):
+        check_truth(tmp_path, [dataclasses.replace(record, original_width=7)])

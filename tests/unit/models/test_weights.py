@@ -152,3 +152,26 @@ def test_the_hub_client_stays_offline_unless_asked(monkeypatch: pytest.MonkeyPat
     assert found.path == file
     assert [call["local_files_only"] for call in calls] == [True, False]
     assert all(call["repo"] == "org/name" and call["revision"] == "abc123" for call in calls)
+
+
+def with_header(folder: Path, header: bytes, tail: bytes = b"") -> Path:
+    path = folder / "w.safetensors"
+    path.write_bytes(len(header).to_bytes(8, "little") + header + tail)
+    return path
+
+
+def offsets(end: str) -> bytes:
+    return b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, ' + end.encode() + b"]}}"
+
+
+@pytest.mark.parametrize(
+    "header",
+    [b"[" * 200_000, b'{"a":' * 200_000, b"[]", b"3", b'{"a": "b"}', b'{"a": {"data_offsets": []}}', b"\xff\xfe",
+     *(offsets(end) for end in ("Infinity", "-Infinity", "NaN", "4.0", "true", '"4"', "null", "[4]", "1e999", "9" * 5000, str(2**70)))],
+    ids=lambda header: header[-16:].decode("latin-1"),
+)  # fmt: skip
+def test_a_header_that_is_none_is_one_line(tmp_path: Path, header: bytes) -> None:
+    path = with_header(tmp_path, header, b"\0\0\0\0")
+    with pytest.raises(UserError) as caught:
+        read_tensors(path)
+    assert len(line_of(caught)) < 400

@@ -141,7 +141,7 @@ def test_key_frames_that_cannot_be_are_refused() -> None:
     ):
         with pytest.raises(UserError, match=message):
             plan_tour(BACKBONE, BACKBONE, replace(CONFIG, path="keyframes", keyframes=keys))
-    with pytest.raises(UserError, match="two finite places"):
+    with pytest.raises(UserError, match="like the eye, must be another place"):
         EyeKey(eye=(0.0, 0.0, 0.0), target=(0.0, 0.0, 0.0))
 
 
@@ -181,10 +181,10 @@ def test_renders_repeat_bit_for_bit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"frames": 1}, r"render\.frames: must be >= 2, is 1"),
-        ({"crf": 52}, r"render\.crf: must be within \[0, 51\], is 52"),
-        ({"orbit_deg": 0.0}, r"render\.orbit_deg: must be within \(0, 360\]"),
-        ({"spiral_radius": 1.5}, r"render\.spiral_radius: must be within \(0, 1\]"),
+        ({"frames": 1}, "frames: is 1, must be from 2 to"),
+        ({"crf": 52}, "crf: is 52, must be from 0 to 51"),
+        ({"orbit_deg": 0.0}, "orbit_deg: is 0.0, must be above 0 and at most 360"),
+        ({"spiral_radius": 1.5}, "spiral_radius: is 1.5, must be above 0 and at most 1"),
         ({"path": "keyframes"}, r"render\.keyframes: path keyframes needs at least two, has 0"),
     ],
 )

@@ -164,3 +164,109 @@ def test_missing_file_and_wrong_ascii_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(raw.rstrip(b"\n") + b" 7\n")
     with pytest.raises(UserError, match="vertex 2 does not hold"):
         read_ply(tmp_path / "a.ply")
+
+
+def linear_file(path: Path, scene: Gaussians, quantities: set[str]) -> None:
+    """The scene as programs write it that store some quantities as they are."""
+    logits = {name: getattr(scene, name) for name in ("opacities", "scales")}
+    if "opacity" in quantities:
+        logits["opacities"] = scene.opacities.sigmoid()
+    if "scale" in quantities:
+        logits["scales"] = scene.scales.exp()
+    foreign_file(path, replace(scene, **logits), LAYOUTS["inria"], "binary_little_endian")
+
+
+@pytest.mark.parametrize("opacity", [None, 0.88, 1.0])
+@pytest.mark.parametrize("quantities", [{"opacity"}, {"scale"}, {"opacity", "scale"}])
+@pytest.mark.parametrize("unit", [0.01, 1.0, 100.0])
+def test_linear_values_are_refused_and_read_when_asked_for(
+    tmp_path: Path, quantities: set[str], unit: float, opacity: float | None
+) -> None:
+    scene = random_gaussians(400, sh_coefficients=1)
+    scene = replace(scene, means=scene.means * unit, scales=scene.scales * unit)
+    if opacity is not None:
+        scene = replace(scene, opacities=torch.full((400,), opacity if "opacity" in quantities else 0.9))
+    path = tmp_path / "linear.ply"
+    linear_file(path, scene, quantities)
+    with pytest.raises(UserError) as caught:
+        read_ply(path)
+    for name, said in (("opacity", "opacities"), ("scale", "scales")):
+        assert (f"its {said} (all" in caught.value.line()) == (name in quantities)
+    again = read_ply(path, linear=quantities)  # type: ignore[arg-type]
+    torch.testing.assert_close(again.opacities, scene.opacities, rtol=0, atol=1e-6)
+    torch.testing.assert_close(again.scales, scene.scales)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"opacities": torch.full((400,), 0.3)},
+        {"opacities": torch.full((400,), 0.5)},  # logits of exactly 0: as they are, nothing would be seen
+        {"opacities": torch.linspace(0.4, 0.99, 400)},
+        # A place in millimetres: every Gaussian is larger than one of them, and none covers its neighbours.
+        {"means": 3000 * random_gaussians(400).means, "scales": 30 + 10 * random_gaussians(400).scales},
+    ],
+    ids=["faint", "half", "most", "millimetres"],
+)
+def test_logits_and_logarithms_are_taken_for_what_they_are(tmp_path: Path, change: dict[str, torch.Tensor]) -> None:
+    scene = replace(random_gaussians(400, sh_coefficients=1), **change)
+    foreign_file(tmp_path / "a.ply", scene, LAYOUTS["inria"], "binary_little_endian")
+    assert_same_scene(read_ply(tmp_path / "a.ply"), scene)
+
+
+def test_of_a_few_gaussians_and_large_units_the_doubt_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    few = replace(random_gaussians(3, sh_coefficients=1), opacities=torch.tensor([0.55, 0.6, 0.7]))
+    foreign_file(tmp_path / "few.ply", few, LAYOUTS["inria"], "binary_little_endian")
+    assert_same_scene(read_ply(tmp_path / "few.ply"), few)
+    assert "taken for logits" in caplog.text
+
+
+def test_what_was_written_here_is_never_in_doubt(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = replace(random_gaussians(400), opacities=torch.linspace(0.51, 0.72, 400), scales=torch.full((400, 3), 1.5))
+    write_ply(scene, tmp_path / "a.ply")
+    assert_same_scene(read_ply(tmp_path / "a.ply"), scene)
+    assert not caplog.text
+
+
+@pytest.mark.parametrize(("quantity", "column"), [("opacity", {"opacities": torch.tensor([0.2, 0.9])}), ("scale", {})])
+def test_values_that_are_not_linear_are_refused_where_linear_ones_are_asked_for(
+    tmp_path: Path, quantity: str, column: dict[str, torch.Tensor]
+) -> None:
+    scene = replace(random_gaussians(2, sh_coefficients=1), **column)
+    foreign_file(tmp_path / "a.ply", scene, LAYOUTS["inria"], "binary_little_endian")
+    with pytest.raises(UserError, match="they are not linear"):
+        read_ply(tmp_path / "a.ply", linear=[quantity])  # type: ignore[list-item]
+
+
+def test_a_compressed_ply_is_named(tmp_path: Path) -> None:
+    header = "ply\nformat binary_little_endian 1.0\nelement chunk 1\n"
+    header += "".join(f"property float {bound}_{axis}\n" for bound in ("min", "max") for axis in "xyz")
+    header += "element vertex 256\n"
+    header += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
+    (tmp_path / "a.ply").write_bytes((header + "end_header\n").encode() + bytes(24 + 16 * 256))
+    with pytest.raises(UserError, match=r"is a compressed PLY \(SuperSplat\), which is not read; convert it"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("encoding", ["binary_little_endian", "ascii"])
+@pytest.mark.parametrize("element", ["vertex", "camera"])
+@pytest.mark.parametrize("count", ["9" * 5000, "9" * 16, "9" * 15, "4294967296", "²", "٣"])
+def test_a_count_that_no_file_holds_is_one_line(tmp_path: Path, encoding: str, element: str, count: str) -> None:
+    foreign_file(tmp_path / "a.ply", random_gaussians(5, sh_coefficients=1), LAYOUTS["gsplat"], encoding)
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    if element == "vertex":
+        header = header.replace(b"vertex 5", b"vertex " + count.encode())
+    else:
+        header = header.replace(
+            b"element vertex", f"element camera {count}\nproperty uchar id\nelement vertex".encode()
+        )
+    (tmp_path / "a.ply").write_bytes(header + b"end_header\n" + body)
+    with pytest.raises(UserError) as caught:
+        read_ply(tmp_path / "a.ply")
+    assert len(caught.value.line()) < 300 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "a\0b", "."])
+def test_a_name_that_is_no_file_is_one_line(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UserError):
+        read_ply(tmp_path / name)

@@ -159,7 +159,7 @@ def test_an_empty_scene_and_bad_values(tmp_path: Path) -> None:
         (lambda raw: b"ply\n" + raw[4:], "its mark is missing"),
         (lambda raw: raw[:4] + b"\x04" + raw[5:], "has SPZ version 4; versions 2 and 3 can be read"),
         (lambda raw: raw[:12] + b"\x09" + raw[13:], "has SH degree 9"),
-        (lambda raw: raw[:8] + b"\xff\xff\xff\xff" + raw[12:], "is truncated: no file of"),
+        (lambda raw: raw[:8] + b"\xff\xff\xff\xff" + raw[12:], "announces 4294967295 Gaussians, too many"),
     ],
 )
 def test_damaged_files_are_refused_in_one_line(tmp_path: Path, damage: Callable[[bytes], bytes], message: str) -> None:
@@ -178,3 +178,46 @@ def test_what_is_no_gzip_is_refused(tmp_path: Path) -> None:
         read_spz(tmp_path / "a.spz")
     with pytest.raises(UserError, match="does not exist"):
         read_spz(tmp_path / "b.spz")
+
+
+@pytest.mark.parametrize("version", [4, 5, 99])
+def test_a_version_with_a_plain_header_is_named(tmp_path: Path, version: int) -> None:
+    (tmp_path / "a.spz").write_bytes(b"NGSP" + version.to_bytes(4, "little") + bytes(40))
+    with pytest.raises(UserError, match=f"is SPZ {version}, which is not read here"):
+        read_spz(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("tail", [b"x", b"\0" * 512, b"PK\3\4more", gzip.compress(b"more")])
+def test_bytes_behind_the_stream_are_refused(tmp_path: Path, tail: bytes) -> None:
+    write_spz(bounded(5), tmp_path / "a.spz")
+    (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes() + tail)
+    with pytest.raises(UserError, match=f"holds {len(tail)} bytes behind its end"):
+        read_spz(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("cut", [1, 4, 8])
+def test_a_stream_without_its_check_sum_is_refused(tmp_path: Path, cut: int) -> None:
+    write_spz(bounded(5), tmp_path / "a.spz")
+    (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:-cut])
+    with pytest.raises(UserError, match="is truncated"):
+        read_spz(tmp_path / "a.spz")
+
+
+def test_few_bytes_that_stand_for_very_many_gaussians_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
+    import tracemalloc
+
+    count = 4_000_000
+    body = HEADER.pack(MAGIC, 3, count, 0, 12, 0, 0) + bytes(20 * count)
+    (tmp_path / "bomb.spz").write_bytes(gzip.compress(body, 9))
+    del body
+    tracemalloc.start()
+    with pytest.raises(UserError, match=f"announces {count} Gaussians, too many for a file of"):
+        read_spz(tmp_path / "bomb.spz")
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "a\0b", "."])
+def test_a_name_that_is_no_file_is_one_line(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UserError):
+        read_spz(tmp_path / name)
