@@ -35,19 +35,24 @@ class Features:
         """Number of keypoints with a descriptor."""
         return int(self.descriptors.shape[0])
 
-    def where(self, shown: Bool[np.ndarray, "height width"] | None) -> Features:
-        """The keypoints whose pixel is ``shown`` (None: all)."""
-        if shown is None:
-            return self
-        height, width = shown.shape
-        column = np.clip(self.pixel_xy[:, 0].astype(np.int64), 0, width - 1)
-        row = np.clip(self.pixel_xy[:, 1].astype(np.int64), 0, height - 1)
-        keep = shown[row, column]
+    def select(self, keep: Bool[np.ndarray, " feature"]) -> Features:
+        """The keypoints that are kept."""
         return Features(pixel_xy=self.pixel_xy[keep], descriptors=self.descriptors[keep[: self.described]])
 
     def joined(self, further_xy: Float[np.ndarray, "further 2"]) -> Features:
         """The same keypoints followed by others that have no descriptor."""
         return Features(pixel_xy=np.concatenate([self.pixel_xy, further_xy]), descriptors=self.descriptors)
+
+
+def lie_in(
+    shown: Bool[np.ndarray, "height width"] | None, xy: Float[np.ndarray, "point 2"]
+) -> Bool[np.ndarray, " point"]:
+    """Which places lie in a mask (None: all do)."""
+    if shown is None:
+        return np.ones(len(xy), bool)
+    height, width = shown.shape
+    column, row = np.floor(xy).astype(np.int64).T
+    return shown[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
 
 
 def grey_u8(image: Float[np.ndarray, "3 height width"]) -> UInt8[np.ndarray, "height width"]:

@@ -18,10 +18,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sceneexpander.frontend.appearance import find_overlay, group_alike, looks_mirrored, patch_agreement
 from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
 from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
-from sceneexpander.frontend.features import Features, detect_features
+from sceneexpander.frontend.features import Features, detect_features, lie_in
 from sceneexpander.frontend.lens_tests import find_distortion, settle_lenses
 from sceneexpander.frontend.lenses import FocalStart, LensPlan, ViewOptics
 from sceneexpander.frontend.mapping import CropOfMain, Mapping
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
 __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "estimate_cameras"]
 
 _SURE_OF_A_TURN = 50  # matches of descriptors that one rotation explains, for learned ones to have no say in it
+_MOST_MIRRORS = 4  # views without a camera that are tried mirrored
 _NOTHING_SHARED = "no other photo shares enough with it"
 Judge = Callable[[SparseReconstruction], float]
 
@@ -103,16 +105,22 @@ def estimate_cameras(
         UserError: known cameras that are no cameras.
         ValueError: tensors whose shapes do not agree.
     """
-    setup = prepare(images, feature_images, config, generator, names)
+    setup = prepare(images, feature_images, config, generator, names, valid)
     known = known_cameras(setup, known_intrinsics_px, known_world_from_cam)
     height, width = images.shape[-2:]
     own = [ViewOptics.of_whole_image(height, width)] * len(images) if optics is None else list(optics)
     if len(own) != len(images):
         raise ValueError(f"{len(own)} optics for {len(images)} views")
     plan = LensPlan.make(config, setup, known, own, focal_hint_px)
-    found = [detect_features(grey, config) for grey in setup.greys]
-    features = [own.where(show) for own, show in zip(found, setup.shown(valid), strict=True)]
-    model = _model(features, None, known, plan, config, setup)
+    features = [detect_features(grey, config) for grey in setup.greys]
+    features = [own.select(lie_in(mask, own.pixel_xy)) for own, mask in zip(features, setup.shown, strict=True)]
+    pairs = _match_all(features, None, config, setup)
+    spots = find_overlay(features, pairs, setup.unit_px)
+    if spots is not None:
+        setup = setup.without(spots)
+        features = [own.select(lie_in(mask, own.pixel_xy)) for own, mask in zip(features, setup.shown, strict=True)]
+        pairs = _match_all(features, None, config, setup)
+    model = _model(features, None, known, plan, config, setup, pairs=pairs)
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
     if choosing and judge is not None and not known.posed.all():
         candidates = [model, *_learned_models(model, (False, True), known, plan, config, setup)]
@@ -130,6 +138,26 @@ def estimate_cameras(
     return _reconstruction(model, plan, config, setup)
 
 
+def _match_all(
+    features: list[Features], learned: _Learned | None, config: SfmConfig, setup: Setup
+) -> list[PairMatches]:
+    """All pairs of views, matched and verified."""
+    return [
+        match_and_verify(
+            a,
+            b,
+            features,
+            config,
+            unit_px=setup.unit_px,
+            seed=setup.seed,
+            learned=None if learned is None else learned.matches.get((a, b)),
+            learned_leads=learned is not None and learned.lead,
+        )
+        for a in range(len(features))
+        for b in range(a + 1, len(features))
+    ]
+
+
 def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Setup) -> SparseReconstruction:
     """A finished model with all views placed and their evidence weighed, in the form that the outside knows."""
     mapping = model.mapping.copy()
@@ -143,6 +171,11 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
             mapping.leave_out(view)
         if refused and mapping.registered.sum() >= 2:
             mapping.finish(refine_focal=model.focal_source is FocalSource.REFINED)
+    for view in np.flatnonzero(~mapping.registered)[:_MOST_MIRRORS].tolist():
+        if view not in refused and looks_mirrored(
+            view, setup.greys, model.features, model.pairs, config, unit_px=setup.unit_px, seed=setup.seed
+        ):
+            refused[view] = "it is mirrored: flip it left to right"
     doubts = {
         view: reason for view, found in evidence.items() if view not in refused and (reason := found.doubt(config))
     }
@@ -182,7 +215,19 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
         evidence=evidence,
         doubts=doubts,
         unrelated=unrelated,
+        notes=_notes(model, setup),
     )
+
+
+def _notes(model: _Model, setup: Setup) -> tuple[str, ...]:
+    """What matches say about the set as a whole."""
+    notes = []
+    if setup.overlay:
+        notes.append("all photos have the same text, logo or watermark at one place: it is not looked at")
+    for views in group_alike(model.features, model.pairs, setup.unit_px):
+        names = ", ".join(setup.names[view] for view in views)
+        notes.append(f"{names}: show the same from the same place and count as one view")
+    return tuple(notes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -219,15 +264,17 @@ def _model(
     plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
+    *,
     distortion: Distortion | None = None,
+    pairs: list[PairMatches] | None = None,
 ) -> _Model:
     """Everything from features to a finished mapping; learned matches of pairs join those of the descriptors.
 
     Where the pictures show that the lens bends them, keypoints are straightened and all is done again. ``distortion`` is what is known
-    of that before.
+    of that before, ``pairs`` are the matches if they are known already.
     """
     found, narrowed = distortion, plan
-    model = _solved(features, found, learned, known, narrowed, config, setup)
+    model = _solved(features, found, learned, known, narrowed, config, setup, pairs=pairs)
     for _ in range(config.distortion_rounds if plan.refine and not known.posed.any() else 0):
         found = find_distortion(model.mapping, model.distortion)
         if found is None:
@@ -246,26 +293,15 @@ def _solved(
     plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
+    *,
+    pairs: list[PairMatches] | None = None,
 ) -> _Model:
     """From keypoints, straightened by ``distortion``, to a finished mapping."""
     features = raw
     if distortion is not None:
         features = [replace(own, pixel_xy=distortion.undistorted(view, own.pixel_xy)) for view, own in enumerate(raw)]
-    views = len(features)
-    pairs = [
-        match_and_verify(
-            a,
-            b,
-            features,
-            config,
-            unit_px=setup.unit_px,
-            seed=setup.seed,
-            learned=None if learned is None else learned.matches.get((a, b)),
-            learned_leads=learned is not None and learned.lead,
-        )
-        for a in range(views)
-        for b in range(a + 1, views)
-    ]
+    if pairs is None:
+        pairs = _match_all(features, learned, config, setup)
     found = _pair_kinds(features, pairs, plan, config, setup, frozenset() if learned is None else learned.turns)
     mapping, source = _map(build_tracks(features, pairs), features, pairs, found, known, plan, config, setup)
     return _Model(
@@ -295,7 +331,15 @@ def _learned_models(
         return []
     keypoints = [learned.detect_learned(image, config) for image in setup.colours]
     features = [own.joined(found.pixel_xy) for own, found in zip(model.raw, keypoints, strict=True)]
-    matches = learned.match_pairs(keypoints, _pairs_worth_matching(model, keypoints, config), config)
+    matches: dict[tuple[int, int], Matches] = {}
+    for (a, b), found in learned.match_pairs(
+        keypoints, _pairs_worth_matching(model, keypoints, config), config
+    ).items():
+        xy_a, xy_b = keypoints[a].pixel_xy[found.index_a], keypoints[b].pixel_xy[found.index_b]
+        shown = lie_in(setup.shown[a], xy_a) & lie_in(setup.shown[b], xy_b)
+        alike = patch_agreement(setup.greys[a], setup.greys[b], xy_a[shown], xy_b[shown])
+        if alike >= config.min_patch_agreement:
+            matches[a, b] = found.select(shown)
     if not any(found.count for found in matches.values()):
         return []
     turns = frozenset(
@@ -340,6 +384,7 @@ class _PairKinds:
     """What the pairs are, and what a turning camera says about its focal length."""
 
     kinds: list[PairKind]
+    distinct: int  # number of views of which no two show the same from the same place
     turning_focal: float | None  # factor on the nominal focal that makes pure rotations of such pairs; None without any
 
 
@@ -394,7 +439,8 @@ def _pair_kinds(
         kinds.append(PairKind.ROTATION if rotation_only else PairKind.PARALLAX)
         if rotation_only:
             factors.append(factor)
-    return _PairKinds(kinds=kinds, turning_focal=float(np.median(factors)) if factors else None)
+    distinct = len(features) - sum(len(views) - 1 for views in group_alike(features, pairs, setup.unit_px))
+    return _PairKinds(kinds=kinds, distinct=distinct, turning_focal=float(np.median(factors)) if factors else None)
 
 
 def _map(
@@ -408,7 +454,7 @@ def _map(
     setup: Setup,
 ) -> tuple[Mapping, FocalSource]:
     """The best model over all focal starts and initial pairs, finished; and where its main focal came from."""
-    enough = len(setup.greys) >= config.min_views_for_focal
+    enough = found.distinct >= config.min_views_for_focal
     few = tracks.longest(config.sweep_tracks)
 
     def grown(start: FocalStart, pair: PairMatches | None) -> Mapping | None:
@@ -447,7 +493,7 @@ def _map(
     model = _on_all_tracks(model, tracks, start, plan, config, setup)
     free = _free_views(model, known, config)
     model.grow(refine_focal=False, free=free)
-    several = int(model.registered.sum()) >= config.min_views_for_focal
+    several = min(int(model.registered.sum()), found.distinct) >= config.min_views_for_focal
     attempted = plan.refine and (start.source is not None or several)
     refine = _finish(model, attempted, free, plan, config)
     # Before matches are found again in epipolar bands: those of a wrong camera would only bring matches that agree with it.

@@ -35,6 +35,7 @@ def build_reconstruction(
     evidence: dict[int, ViewEvidence],
     doubts: dict[int, str],
     unrelated: int | None,
+    notes: tuple[str, ...],
 ) -> SparseReconstruction:
     """Change frame, scale and pixels; write the report.
 
@@ -50,6 +51,7 @@ def build_reconstruction(
         plan: which views share a lens, and what their files say.
         evidence: of views that the model adjusted.
         doubts: why a posed view is only roughly right.
+        notes: about the set, from its matches.
         unrelated: the view that is the frame of reference and nothing else, since no other could be placed by it.
     """
     world_from_cam, points, scale = _normalised(mapping)
@@ -96,7 +98,7 @@ def build_reconstruction(
         median_angle_deg=float(np.median(angles)) if len(used) else float("nan"),
         mean_error_px=float(np.nanmean(errors)) if len(rows) else float("nan"),
         scale=scale,
-        notes=_notes(mapping, focal_source),
+        notes=(*notes, *_notes(mapping, focal_source)),
     )
     return SparseReconstruction(
         world_from_cam=torch.from_numpy(world_from_cam.astype(np.float32)),

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.errors import UserError
 from sceneexpander.frontend.features import grey_u8
 from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, SfmConfig
 
-_MASK_MARGIN_PX = 6  # at 768 px: the edge of a mask is no corner of the place
+_MASK_MARGIN_PX = 6  # at 768 px
+_SAME_SPOT_PX = 3.0  # at 768 px: keypoints this near to those of an overlay go with them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,10 +25,21 @@ class Setup:
 
     colours: Float[Tensor, "view 3 height width"]  # on the CPU
     greys: list[np.ndarray]
+    shown: tuple[np.ndarray | None, ...]  # per view which feature pixels show the place; None: all
     names: tuple[str, ...]
     scale_xy: np.ndarray  # pixels of the given images per pixel of the feature images
     unit_px: float
     seed: int
+    overlay: bool = False  # something is drawn over all pictures; ``shown`` leaves it out
+
+    def without(self, spots_xy: np.ndarray) -> Setup:
+        """The same with the spots of an overlay not shown."""
+        masks = [
+            np.ones(grey.shape, bool) if mask is None else mask
+            for grey, mask in zip(self.greys, self.shown, strict=True)
+        ]
+        shown = tuple(without_spots(mask, spots_xy, self.unit_px) for mask in masks)
+        return replace(self, shown=shown, overlay=True)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -40,18 +52,19 @@ class Setup:
         """Longer side of the feature images in pixels."""
         return max(self.size)
 
-    def shown(self, valid: Tensor | None) -> list[np.ndarray | None]:
-        """Per view which feature pixels show the place, a keypoint's own surroundings away from those that do not."""
-        if valid is None:
-            return [None] * len(self.greys)
-        height, width = self.size
-        reach = max(1, round(_MASK_MARGIN_PX * self.unit_px))
-        kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-        masks = []
-        for mask in valid.cpu().numpy().astype(np.uint8):
-            large = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
-            masks.append(cv2.erode(large, kernel, borderValue=1).astype(bool))
-        return list(masks)
+
+def shown_pixels(valid: Tensor | None, greys: Sequence[np.ndarray], unit_px: float) -> tuple[np.ndarray | None, ...]:
+    """Per view which feature pixels show the place (None: all), with a margin: the edge of a mask is no corner of the place."""
+    if valid is None:
+        return (None,) * len(greys)
+    height, width = greys[0].shape
+    reach = max(1, round(_MASK_MARGIN_PX * unit_px))
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    masks = []
+    for mask in valid.cpu().numpy().astype(np.uint8):
+        large = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
+        masks.append(cv2.erode(large, kernel, borderValue=1).astype(bool))
+    return tuple(masks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +82,7 @@ def prepare(
     config: SfmConfig,
     generator: torch.Generator,
     names: Sequence[str] | None,
+    valid: Tensor | None = None,
 ) -> Setup:
     """Check shapes, make grey images and draw the seed."""
     if images.ndim != 4 or images.shape[1] != 3 or images.shape[0] < 1:
@@ -82,14 +96,29 @@ def prepare(
     height, width = source.shape[2:]
     # Always one draw, so that the caller's stream does not depend on what was found.
     seed = int(torch.randint(0, 2**30, (1,), generator=generator).item())
+    if valid is not None and valid.shape != (images.shape[0], *images.shape[2:]):
+        raise ValueError(f"masks {tuple(valid.shape)} do not belong to images {tuple(images.shape)}")
+    greys = [grey_u8(image) for image in source.detach().cpu().numpy()]
     return Setup(
         colours=source.detach().cpu(),
-        greys=[grey_u8(image) for image in source.detach().cpu().numpy()],
+        greys=greys,
+        shown=shown_pixels(valid, greys, max(height, width) / REFERENCE_LONG_SIDE_PX),
         names=labels,
         scale_xy=np.array([images.shape[3] / width, images.shape[2] / height]),
         unit_px=max(height, width) / REFERENCE_LONG_SIDE_PX,
         seed=seed,
     )
+
+
+def without_spots(
+    shown: Bool[np.ndarray, "height width"], spots_xy: Float[np.ndarray, "spot 2"], unit_px: float
+) -> Bool[np.ndarray, "height width"]:
+    """A mask with discs cut out around the spots of an overlay."""
+    mask = shown.astype(np.uint8)
+    radius = max(1, round(_SAME_SPOT_PX * unit_px))
+    for x, y in np.unique(np.floor(spots_xy).astype(int), axis=0).tolist():
+        cv2.circle(mask, (x, y), radius, 0, -1)
+    return mask.astype(bool)
 
 
 def known_cameras(setup: Setup, intrinsics_px: Tensor | None, world_from_cam: Tensor | None) -> KnownCameras:

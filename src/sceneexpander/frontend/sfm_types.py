@@ -65,6 +65,9 @@ class SfmConfig:
     learned_neighbours: Annotated[int, Range(0, 1_000)] = (
         4  # of each view that SIFT has connected: the others it is matched with
     )
+    min_patch_agreement: Share = (
+        0.35  # mean correlation of patches at a pair's learned matches: they find structure in noise, too
+    )
 
     # Verification of pairs.
     epipolar_px: Annotated[float, Range(0, 1000, low_open=True)] = (
