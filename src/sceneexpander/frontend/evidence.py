@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sceneexpander.frontend.bundle import LOG_FOCAL
-from sceneexpander.frontend.epipolar import EpipolarFit, OtherView
+from sceneexpander.frontend.epipolar import EpipolarFit, OtherView, held_lens
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.sfm_types import SfmConfig
@@ -22,6 +22,9 @@ from sceneexpander.frontend.twoview import PairMatches, relative_pose
 
 _AGREE_PX = 3.0  # at 768 px: a match this near its epipolar lines agrees with the cameras
 _MIN_MATCHES = 30  # fewer say nothing about a camera
+_OWN_FOCAL_SIGMA = (
+    0.02  # of the logarithm: how well pictures tell the focal of a single view, measured on zoomed photos
+)
 _NOISE_PX = 0.5  # at 768 px: systematic errors of keypoints that the scatter of their errors does not show
 
 
@@ -33,13 +36,14 @@ class ViewEvidence:
         agreeing: share of its matches, as verified before any camera was known, that lie on the epipolar lines of the model.
         rotation_gap_deg: median over the other views of the angle between the model's relative rotation and that of the pair alone.
         direction_sigma_deg: median over the other views of how far the direction to them may be off (one standard deviation).
-        own_focal: its lens is its own and only the pictures say what its focal is.
+        focal_sigma_deg: how far the directions to the others move if its focal is off by as much as pictures alone leave it uncertain;
+            0 where the focal is shared or known from elsewhere.
     """
 
     agreeing: float
     rotation_gap_deg: float
     direction_sigma_deg: float
-    own_focal: bool
+    focal_sigma_deg: float
 
     def refusal(self, config: SfmConfig) -> str:
         """Why the camera cannot be believed; empty if it can."""
@@ -47,10 +51,10 @@ class ViewEvidence:
             return f"only {self.agreeing:.0%} of its matches with other photos agree with any camera"
         if self.rotation_gap_deg > config.max_rotation_gap_deg:
             return f"its turns against other photos contradict each other by {self.rotation_gap_deg:.0f} degrees"
-        if self.own_focal and self.direction_sigma_deg > config.max_own_direction_deg:
+        if self.focal_sigma_deg > config.max_own_direction_deg:
             return (
-                "it was taken with another focal length (zoomed or cropped), and what it shows is too flat to tell which:"
-                f" its position may be off by {2 * self.direction_sigma_deg:.0f} degrees"
+                "it was taken with another focal length (zoomed or cropped), which the pictures tell too roughly:"
+                f" its direction may be off by {self.focal_sigma_deg:.0f} degrees"
             )
         return ""
 
@@ -86,7 +90,11 @@ def weigh_evidence(
             agreeing=_agreeing_share(mapping, view, features, pairs),
             rotation_gap_deg=float(np.median(turned)) if len(turned) >= 2 else float("nan"),
             direction_sigma_deg=float(np.median(row)) if len(row) else float("nan"),
-            own_focal=_focal_is_own(mapping, view) and not hinted[view],
+            focal_sigma_deg=(
+                _focal_sigma_deg(mapping, view, features, pairs)
+                if _focal_is_own(mapping, view) and not hinted[view]
+                else 0.0
+            ),
         )
     return found
 
@@ -153,6 +161,30 @@ def _rotation_gaps_deg(
         cosine = (np.trace(pose.rotation @ model.T) - 1) / 2
         gaps[a, b] = gaps[b, a] = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
     return gaps
+
+
+def _focal_sigma_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
+    """Median over the other views of the angle by which the direction to them moves between two focals that both fit."""
+    others = other_views(mapping, view, features, pairs)
+    if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
+        return 180.0
+    fit = EpipolarFit(
+        others,
+        mapping.start_intrinsics[view],
+        mapping.shift_unit_px[view],
+        noise_px=_NOISE_PX * mapping.unit_px,
+    )
+    centres = []
+    for step in (-_OWN_FOCAL_SIGMA, _OWN_FOCAL_SIGMA):
+        lens = mapping.lenses.resolved[mapping.lens_of[view]].copy()
+        lens[LOG_FOCAL] += step
+        found = fit.refine(mapping.rotations[view], mapping.translations[view], lens, held_lens())
+        centres.append(-found.rotation.T @ found.translation)
+    angles = []
+    for other in others:
+        a, b = (centre + other.rotation.T @ other.translation for centre in centres)
+        angles.append(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)) / 2)
+    return float(np.median(angles))
 
 
 def _focal_is_own(mapping: Mapping, view: int) -> bool:

@@ -32,6 +32,8 @@ _OWN_SHIFT = 0.03  # of the long side: principal points of whole photos are with
 _MAX_SHIFT = 0.5  # a crop that keeps a corner of a quarter of the area moves the centre by half
 _SHIFT_SIGMA = 0.2  # prior of a cropped picture's principal point
 _K_SIGMA = (0.3, 0.3)  # priors of k1 and k2; wide action cameras have k1 near -.3
+_BEND_ROUNDS = 8  # of looking for distortion; strong barrels settle in five
+_BEND_SETTLED_PX = 0.4  # at 768 px
 _MIN_BEND_PX = 1.0  # at 768 px: distortion that moves the outermost points less than this is left alone
 _GAIN = 60.0  # of log-likelihood, by which a freer lens must explain a whole model better: eight correlated errors count as one
 
@@ -191,11 +193,31 @@ def _gain(held: BundleResult, freed: BundleResult) -> float:
 def find_distortion(mapping: Mapping, before: Distortion | None) -> Distortion | None:
     """Radial distortion of the model's photos, or None if the pictures show none.
 
+    Strong distortion bends the model itself, and what does not fit the bent model was dropped: so tracks are straightened, the model is
+    finished again, and distortion is looked for anew until it no longer changes.
+
     Args:
-        mapping: finished over pixels that ``before`` has straightened.
+        mapping: finished over pixels that ``before`` has straightened; unchanged.
         before: what was taken out already; found anew together with the focals.
     """
-    raw = mapping.tracks.pixel_xy
+    raw = mapping.tracks.pixel_xy if before is None else before.distorted_tracks(mapping.tracks.pixel_xy)
+    model, found = mapping.copy(), before
+    for _ in range(_BEND_ROUNDS):
+        again = _bend_of(model, found, raw)
+        if again is None:
+            break
+        moved = _bend_px(again, model, raw, than=found)
+        found = again
+        straight = np.stack([found.undistorted(view, raw[:, view]) for view in range(raw.shape[1])], 1)
+        model.tracks = replace(model.tracks, pixel_xy=straight)
+        model.finish(refine_focal=True)
+        if moved < _BEND_SETTLED_PX:
+            break
+    return None if found is before else found
+
+
+def _bend_of(mapping: Mapping, before: Distortion | None, raw: np.ndarray) -> Distortion | None:
+    """Distortion that explains a model much better than ``before``; None if none does."""
     values = mapping.lenses.values.copy()
     lenses = [
         int(lens)
@@ -205,7 +227,6 @@ def find_distortion(mapping: Mapping, before: Distortion | None) -> Distortion |
     if mapping.registered.sum() < 3 or not lenses:
         return None
     if before is not None:
-        raw = before.distorted_tracks(raw)
         for view in np.flatnonzero(mapping.registered):
             values[mapping.lens_of[view], [K1, K2]] = before.coefficients_at(int(view), mapping.intrinsics[view])
     free, sigma = mapping.lenses.free.copy(), mapping.prior_sigma.copy()
@@ -217,22 +238,21 @@ def find_distortion(mapping: Mapping, before: Distortion | None) -> Distortion |
     if held is None or freed is None:
         return None
     k = freed.problem.lenses.values[mapping.lens_of][:, [K1, K2]]
-    intrinsics = mapping.intrinsics_of(freed)
-    found = Distortion(intrinsics=intrinsics, k=k)
-    bend = _corner_bend_px(found, mapping, freed) / mapping.unit_px
+    found = Distortion(intrinsics=mapping.intrinsics_of(freed), k=k)
+    bend = _bend_px(found, mapping, raw, than=None)
     _log.debug("distortion %s, moves corners %.2f px, gain %.1f", k[0].round(4), bend, _gain(held, freed))
     if bend < _MIN_BEND_PX or (before is None and _gain(held, freed) < _GAIN):
         return None
     return found
 
 
-def _corner_bend_px(distortion: Distortion, mapping: Mapping, result: BundleResult) -> float:
-    """How far the outermost tenth of the observations is moved, at the view where that is most."""
+def _bend_px(distortion: Distortion, mapping: Mapping, raw: np.ndarray, *, than: Distortion | None) -> float:
+    """How far (at 768 px) the outermost observations are moved against another distortion, at the view where that is most."""
     most = 0.0
-    problem = result.problem
-    for view in np.flatnonzero(mapping.registered):
-        xy = problem.pixel_xy[problem.camera_index == view]
+    for view in np.flatnonzero(mapping.registered).tolist():
+        xy = raw[mapping.active[:, view], view]
         if len(xy):
-            moved = np.linalg.norm(distortion.undistorted(int(view), xy) - xy, axis=1)
+            old = xy if than is None else than.undistorted(view, xy)
+            moved = np.linalg.norm(distortion.undistorted(view, xy) - old, axis=1)
             most = max(most, float(np.quantile(moved, 0.95)))
-    return most
+    return most / mapping.unit_px

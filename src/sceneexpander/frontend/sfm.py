@@ -463,7 +463,7 @@ def _map(
             _set_known_poses(candidate, known)
         elif not _set_initial_pair(candidate, features, pair, config):
             return None
-        refine = plan.refine and (enough or start.source is not None)
+        refine = plan.refine and (enough or (start.source is not None and found.distinct > 2))
         candidate.grow(refine_focal=refine, free=_free_views(candidate, known, config))
         return candidate
 
@@ -494,7 +494,8 @@ def _map(
     free = _free_views(model, known, config)
     model.grow(refine_focal=False, free=free)
     several = min(int(model.registered.sum()), found.distinct) >= config.min_views_for_focal
-    attempted = plan.refine and (start.source is not None or several)
+    # Two views fit other focals as well as the one that their files say.
+    attempted = plan.refine and (several or (start.source is not None and found.distinct > 2))
     refine = _finish(model, attempted, free, plan, config)
     # Before matches are found again in epipolar bands: those of a wrong camera would only bring matches that agree with it.
     for _ in range(config.lens_rounds if refine else 0):

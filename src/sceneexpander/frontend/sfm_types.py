@@ -84,7 +84,7 @@ class SfmConfig:
     focal_bounds: tuple[_Focal, _Focal] = (0.3, 4.0)  # ultra-wide and tele lenses of phones are .36 and 3.3
     focal_prior: _Focal = 0.85  # phones .7-.75, 35-50 mm lenses 1-1.4, wide lenses .5-.6
     focal_prior_sigma: Annotated[float, Range(0, 10, low_open=True)] = 0.25  # of the logarithm
-    focal_hint_sigma: Annotated[float, Range(0, 10, low_open=True)] = 0.05  # of the logarithm, around a focal from EXIF
+    focal_hint_sigma: Annotated[float, Range(0, 10, low_open=True)] = 0.03  # of the logarithm, around a focal from EXIF
     focal_hint_penalty: Weight = 60.0  # observations that another focal must explain beyond those that EXIF's does
     generated_focal_sigma: Annotated[float, Range(0, 10, low_open=True)] = (
         0.1  # of the logarithm: a generated picture's focal around that of the photos
