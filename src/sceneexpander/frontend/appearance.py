@@ -23,7 +23,7 @@ _MOVING_PX = 6.0  # how far the others must move (median) for the still ones to 
 _MOST_STILL = 0.75  # a larger share lies still where the camera did
 
 _ALIKE_PX = 2.0  # at 768 px: median motion of the matches of two views that count as one
-_ALIKE_SHARE = 0.35  # of the keypoints of the poorer view, that are matched
+_ALIKE_MATCHES = 30
 
 _MIRROR_MATCHES = 30
 _MIRROR_GAIN = 2.0  # times as many as unmirrored
@@ -88,7 +88,7 @@ def group_alike(features: Sequence[Features], pairs: Sequence[PairMatches], unit
     for pair in pairs:
         a, b = features[pair.view_a], features[pair.view_b]
         matches = pair.verified
-        if matches.count == 0 or matches.count < _ALIKE_SHARE * min(a.described, b.described):
+        if matches.count < _ALIKE_MATCHES:
             continue
         moves = np.linalg.norm(a.pixel_xy[matches.index_a] - b.pixel_xy[matches.index_b], axis=1)
         if np.median(moves) < _ALIKE_PX * unit_px:
@@ -100,6 +100,7 @@ def group_alike(features: Sequence[Features], pairs: Sequence[PairMatches], unit
 
 def looks_mirrored(
     view: int,
+    against: Sequence[int],
     greys: Sequence[UInt8[np.ndarray, "height width"]],
     features: Sequence[Features],
     pairs: Sequence[PairMatches],
@@ -108,13 +109,16 @@ def looks_mirrored(
     unit_px: float,
     seed: int,
 ) -> bool:
-    """Whether a view matches the others much better when it is flipped left to right."""
-    as_it_is = [pair.verified.count for pair in pairs if view in (pair.view_a, pair.view_b)]
+    """Whether a view matches the views ``against`` much better when it is flipped left to right."""
+    others = set(against) - {view}
+    as_it_is = [
+        pair.verified.count
+        for pair in pairs
+        if view in (pair.view_a, pair.view_b) and others & {pair.view_a, pair.view_b}
+    ]
     flipped = detect_features(np.ascontiguousarray(greys[view][:, ::-1]), config)
-    best = 0
-    for other in range(len(features)):
-        if other == view:
-            continue
-        both = [flipped, features[other]]
-        best = max(best, match_and_verify(0, 1, both, config, unit_px=unit_px, seed=seed).verified.count)
-    return best >= max(_MIRROR_MATCHES, _MIRROR_GAIN * max(as_it_is, default=0))
+    mirrored = [
+        match_and_verify(0, 1, [flipped, features[other]], config, unit_px=unit_px, seed=seed).verified.count
+        for other in sorted(others)
+    ]
+    return max(mirrored, default=0) >= max(_MIRROR_MATCHES, _MIRROR_GAIN * max(as_it_is, default=0))

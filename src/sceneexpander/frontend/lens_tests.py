@@ -26,6 +26,8 @@ _log = logging.getLogger(__name__)
 _MIN_MATCHES = 60  # of a view with all others: fewer say too little about its lens
 _NOISE_PX = 0.5  # at 768 px: of matches, for their distance from epipolar lines
 _STANDS_OUT = 1.25  # times the usual share of what stays unexplained
+_ODD = 1.6  # times the usual: views that are left out, and brought back by the cameras of the others
+_SNAP = 0.05  # of the logarithm of the focal
 _KEEP_BEST = 4  # poses at other focals that are refined
 _OWN_FOCAL = 0.04  # of the logarithm: nearer to the shared focal than this nothing is gained by another
 _OWN_SHIFT = 0.03  # of the long side: principal points of whole photos are within a hundredth or two of the centre
@@ -65,6 +67,41 @@ def settle_lenses(mapping: Mapping, features: Sequence[Features], pairs: Sequenc
         if (mapping.registered & (mapping.lens_of == lens)).sum() >= 3 and _free_shift(mapping, int(lens)):
             return True
     return False
+
+
+def find_odd_views(mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches]) -> list[int]:
+    """Views of which much more stays unexplained than is usual, worst first; so few that at least three are left."""
+    seen = {view: other_views(mapping, view, features, pairs) for view in np.flatnonzero(mapping.registered).tolist()}
+    costs = {
+        view: _LensCheck(mapping, view, others).now.cost
+        for view, others in seen.items()
+        if sum(len(other.own_xy) for other in others) >= _MIN_MATCHES
+    }
+    if len(costs) < 4:
+        return []
+    # The usual is that of the better half: the odd ones spoil some matches of every other view.
+    usual = float(np.median(sorted(costs.values())[: (len(costs) + 1) // 2 + 1]))
+    odd = sorted((view for view, cost in costs.items() if cost > _ODD * usual), key=lambda view: -costs[view])
+    return odd[: len(costs) - 3]
+
+
+def snap_lenses(mapping: Mapping) -> bool:
+    """Let focals that come near a likely one (the same field of view, the same focal in original pixels) be exactly that.
+
+    Two photos cut to another shape tell their common focal worse than all photos together tell the one that they were cut from.
+    """
+    changed = False
+    main = mapping.lens_of[mapping.main]
+    for lens in np.unique(mapping.lens_of[mapping.registered]):
+        view = int(np.flatnonzero(mapping.lens_of == lens)[0])
+        if lens == main or view not in mapping.lens_guesses or mapping.lenses.focal_of[lens] != lens:
+            continue
+        apart = float(mapping.log_focal[view] - mapping.log_focal[mapping.main])
+        nearest = min((0.0, *mapping.lens_guesses[view]), key=lambda guess: abs(guess - apart))
+        if abs(nearest - apart) < _SNAP:
+            mapping.follow_focal(view, mapping.main, nearest)
+            changed = True
+    return changed
 
 
 class _LensCheck:

@@ -124,11 +124,13 @@ class LensPlan:
             return None
         whole = self.original_sizes[int(np.flatnonzero(self.lens_of == self.main)[0])]
         part = self.original_sizes[view]
-        room = [np.subtract(turned, part) for turned in (whole, whole[::-1])]
+        room = [
+            np.subtract(turned, part) for turned in (whole, whole[::-1])
+        ]  # held as most photos were, or else turned
         fits = [r for r in room if (r >= 0).all() and (r > 0).any()]
         if not fits:
             return None
-        height, width = np.max(fits, 0) / (2 * self.originals_px[view]) + _CROP_SLACK
+        height, width = fits[0] / (2 * self.originals_px[view]) + _CROP_SLACK
         return float(width), float(height)
 
     @classmethod

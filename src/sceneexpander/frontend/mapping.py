@@ -173,7 +173,7 @@ class Mapping:
         self.rotations, self.translations = other.rotations.copy(), other.translations.copy()
         self.registered = other.registered.copy()
         self.lens_of, self.lenses, self.lens_sigma = other.lens_of.copy(), other.lenses, other.lens_sigma
-        self.prior_sigma, self.penalty = other.prior_sigma, other.penalty
+        self.prior_sigma, self.penalty, self.main = other.prior_sigma, other.penalty, other.main
 
     def triangulate(self, *, threshold_px: float) -> None:
         """Find points for tracks that have none, from the best pair of their views.
@@ -323,6 +323,8 @@ class Mapping:
         others = np.flatnonzero((self.lens_of == old) & (np.arange(len(self.lens_of)) != view))
         if len(others) == 0:
             return
+        if view == self.main:
+            self.main = int(others[0])
         names = ("values", "free", "low", "high", "prior", "focal_of", "offset")
         tables = {name: getattr(self.lenses, name).copy() for name in names}
         tables["sigma"] = self.prior_sigma.copy()

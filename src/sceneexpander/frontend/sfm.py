@@ -19,15 +19,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.frontend.appearance import find_overlay, group_alike, looks_mirrored, patch_agreement
-from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
 from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
 from sceneexpander.frontend.features import Features, detect_features, lie_in
-from sceneexpander.frontend.lens_tests import find_distortion, settle_lenses
-from sceneexpander.frontend.lenses import FocalStart, LensPlan, ViewOptics
-from sceneexpander.frontend.mapping import CropOfMain, Mapping
+from sceneexpander.frontend.lens_tests import find_distortion
+from sceneexpander.frontend.lenses import LensPlan, ViewOptics
+from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.matching import Matches
 from sceneexpander.frontend.placement import place_remaining, thumbnails_of
+from sceneexpander.frontend.search import CameraSearch, PairKinds
 from sceneexpander.frontend.sfm_report import build_reconstruction
 from sceneexpander.frontend.sfm_setup import KnownCameras, Setup, known_cameras, prepare
 from sceneexpander.frontend.sfm_types import (
@@ -40,14 +40,10 @@ from sceneexpander.frontend.sfm_types import (
     SparseReconstruction,
     ViewReport,
 )
-from sceneexpander.frontend.tracks import Tracks, build_tracks
 from sceneexpander.frontend.twoview import (
     PairMatches,
     fit_rotation,
-    fundamental_from_poses,
     match_and_verify,
-    match_guided,
-    relative_pose,
     rotation_focal,
     scaled_focal,
 )
@@ -171,9 +167,10 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
             mapping.leave_out(view)
         if refused and mapping.registered.sum() >= 2:
             mapping.finish(refine_focal=model.focal_source is FocalSource.REFINED)
+    known_views = np.flatnonzero(mapping.registered).tolist() or [0]
     for view in np.flatnonzero(~mapping.registered)[:_MOST_MIRRORS].tolist():
         if view not in refused and looks_mirrored(
-            view, setup.greys, model.features, model.pairs, config, unit_px=setup.unit_px, seed=setup.seed
+            view, known_views, setup.greys, model.features, model.pairs, config, unit_px=setup.unit_px, seed=setup.seed
         ):
             refused[view] = "it is mirrored: flip it left to right"
     doubts = {
@@ -303,7 +300,10 @@ def _solved(
     if pairs is None:
         pairs = _match_all(features, learned, config, setup)
     found = _pair_kinds(features, pairs, plan, config, setup, frozenset() if learned is None else learned.turns)
-    mapping, source = _map(build_tracks(features, pairs), features, pairs, found, known, plan, config, setup)
+    search = CameraSearch(
+        features=features, pairs=pairs, found=found, known=known, plan=plan, config=config, setup=setup
+    )
+    mapping, source = search.run()
     return _Model(
         raw=raw,
         features=features,
@@ -379,15 +379,6 @@ def _pairs_worth_matching(model: _Model, keypoints: list[LearnedKeypoints], conf
     return sorted(worth)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _PairKinds:
-    """What the pairs are, and what a turning camera says about its focal length."""
-
-    kinds: list[PairKind]
-    distinct: int  # number of views of which no two show the same from the same place
-    turning_focal: float | None  # factor on the nominal focal that makes pure rotations of such pairs; None without any
-
-
 def _pair_kinds(
     features: list[Features],
     pairs: list[PairMatches],
@@ -395,7 +386,7 @@ def _pair_kinds(
     config: SfmConfig,
     setup: Setup,
     turns: frozenset[tuple[int, int]],
-) -> _PairKinds:
+) -> PairKinds:
     """Which pairs have parallax.
 
     A wrong focal bends a wide turn so much that it looks like parallax, so where the focal is unknown the one that turns the pair's
@@ -440,241 +431,4 @@ def _pair_kinds(
         if rotation_only:
             factors.append(factor)
     distinct = len(features) - sum(len(views) - 1 for views in group_alike(features, pairs, setup.unit_px))
-    return _PairKinds(kinds=kinds, distinct=distinct, turning_focal=float(np.median(factors)) if factors else None)
-
-
-def _map(
-    tracks: Tracks,
-    features: list[Features],
-    pairs: list[PairMatches],
-    found: _PairKinds,
-    known: KnownCameras,
-    plan: LensPlan,
-    config: SfmConfig,
-    setup: Setup,
-) -> tuple[Mapping, FocalSource]:
-    """The best model over all focal starts and initial pairs, finished; and where its main focal came from."""
-    enough = found.distinct >= config.min_views_for_focal
-    few = tracks.longest(config.sweep_tracks)
-
-    def grown(start: FocalStart, pair: PairMatches | None) -> Mapping | None:
-        candidate = _new_mapping(few, start, plan, config, setup)
-        if pair is None:
-            _set_known_poses(candidate, known)
-        elif not _set_initial_pair(candidate, features, pair, config):
-            return None
-        refine = plan.refine and (enough or (start.source is not None and found.distinct > 2))
-        candidate.grow(refine_focal=refine, free=_free_views(candidate, known, config))
-        return candidate
-
-    initial: list[PairMatches | None] = [None]
-    if not known.posed.any():
-        initial = _initial_pairs(features, pairs, found.kinds, plan, config, setup)
-    best: tuple[float, Mapping, FocalStart] | None = None
-    for position, pair in enumerate(initial):
-        # The first pair finds the focal; further pairs only have to beat it there. Unless the first one leaves much unexplained:
-        # then one of its views may have another lens than the rest, and its focal says nothing.
-        doubtful = best is None or best[0] < config.focal_doubt_share * few.seen.sum()
-        starts = plan.starts if position == 0 or doubtful or best is None else (best[2],)
-        for start in starts:
-            candidate = grown(start, pair)
-            if candidate is not None and (best is None or candidate.score() > best[0]):
-                best = candidate.score(), candidate, start
-    if best is None or not best[1].valid.any():
-        turning = 1.0 if found.turning_focal is None else found.turning_focal
-        start = replace(plan.starts[0], ratio=turning * (plan.starts[0].ratio if plan.source else config.focal_prior))
-        empty = _new_mapping(tracks, start, plan, config, setup)
-        _set_known_poses(empty, known)
-        return empty, plan.source or (FocalSource.ASSUMED if turning == 1 else FocalSource.TURNED)
-    _, model, start = best
-    _log.debug(
-        "started from a focal of %.2f, found %.3f", start.ratio, start.ratio * np.exp(model.log_focal[plan.main])
-    )
-    model = _on_all_tracks(model, tracks, start, plan, config, setup)
-    free = _free_views(model, known, config)
-    model.grow(refine_focal=False, free=free)
-    several = min(int(model.registered.sum()), found.distinct) >= config.min_views_for_focal
-    # Two views fit other focals as well as the one that their files say.
-    attempted = plan.refine and (several or (start.source is not None and found.distinct > 2))
-    refine = _finish(model, attempted, free, plan, config)
-    # Before matches are found again in epipolar bands: those of a wrong camera would only bring matches that agree with it.
-    for _ in range(config.lens_rounds if refine else 0):
-        freer = model.copy()
-        if not settle_lenses(freer, features, pairs):
-            break
-        freer.grow(refine_focal=True, free=free)
-        refined = _finish(freer, refine, free, plan, config)
-        _log.debug("other lenses: score %.1f -> %.1f", model.score(), freer.score())
-        if freer.score() <= model.score():
-            break
-        model, refine = freer, refined
-    if config.guided:
-        again = build_tracks(features, _guided_pairs(model, features, pairs, config))
-        model = _on_all_tracks(model, again, start, plan, config, setup)
-        model.grow(refine_focal=False, free=_free_views(model, known, config))
-        refine = _finish(model, refine, free, plan, config)
-    if refine:
-        return model, FocalSource.REFINED
-    return model, start.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)
-
-
-def _new_mapping(tracks: Tracks, start: FocalStart, plan: LensPlan, config: SfmConfig, setup: Setup) -> Mapping:
-    """An empty model with start intrinsics, and bounds and priors of the focals relative to them."""
-    intrinsics = plan.intrinsics(start.ratio)
-    views = len(plan.lens_of)
-    lenses = Lenses.nominal(views)
-    sigma = np.full(lenses.values.shape, np.inf)
-    ratios = intrinsics[:, 0, 0] / plan.units_px[:, 0]
-    low, high = config.focal_bounds
-    # A given focal outside the bounds is believed, and stays where it is.
-    lenses.low[:, LOG_FOCAL] = np.minimum(np.log(low / ratios), 0.0)
-    lenses.high[:, LOG_FOCAL] = np.maximum(np.log(high / ratios), 0.0)
-    lenses.free[:, LOG_FOCAL] = True
-    guesses: dict[int, tuple[float, ...]] = {}
-    crops: dict[int, CropOfMain] = {}
-    for view in range(views):
-        lens = plan.lens_of[view]
-        if plan.known is not None or lens == plan.main:
-            lenses.prior[view, LOG_FOCAL] = np.log(start.prior / start.ratio)
-            sigma[view, LOG_FOCAL] = start.sigma
-            continue
-        likely = plan.guesses(view, start.ratio)
-        guesses[view] = tuple(float(np.log(other / likely[0])) for other in likely[1:])
-        limits = plan.crop_of_main(view)
-        if limits is not None:
-            crops[view] = CropOfMain(log_focal=guesses[view][-1], limit_x=limits[0], limit_y=limits[1])
-        hinted = bool(np.isfinite(plan.focal_hints[lens])) and start.source is not None
-        sigma[view, LOG_FOCAL] = config.focal_hint_sigma if hinted else config.split_focal_sigma
-        if plan.generated[view]:
-            sigma[view, LOG_FOCAL] = config.generated_focal_sigma
-    return Mapping(
-        tracks,
-        intrinsics,
-        config,
-        unit_px=setup.unit_px,
-        seed=setup.seed,
-        lens_of=plan.lens_of,
-        shift_unit_px=plan.units_px,
-        lenses=lenses,
-        prior_sigma=sigma,
-        guesses=guesses,
-        crops=crops,
-        main=plan.main,
-        penalty=start.penalty,
-    )
-
-
-def _finish(mapping: Mapping, refine: bool, free: np.ndarray | None, plan: LensPlan, config: SfmConfig) -> bool:
-    """Finish a model; a main focal that turns out too uncertain falls back to its prior. Returns whether it was refined."""
-    mapping.finish(refine_focal=refine, free=free)
-    main = mapping.lens_of[plan.main]
-    if refine and mapping.lens_sigma[main, LOG_FOCAL] > config.max_focal_sigma:
-        uncertain = float(mapping.lens_sigma[main, LOG_FOCAL])
-        _log.info("focal is uncertain (sigma of its logarithm %.2f): the prior is kept", uncertain)
-        values = mapping.lenses.values.copy()
-        values[main, LOG_FOCAL] = mapping.lenses.prior[main, LOG_FOCAL]
-        mapping.lenses = replace(mapping.lenses, values=values)
-        mapping.finish(refine_focal=False, free=free)
-        return False
-    return refine
-
-
-def _guided_pairs(
-    mapping: Mapping, features: list[Features], pairs: list[PairMatches], config: SfmConfig
-) -> list[PairMatches]:
-    """All pairs, those of registered views with motion between them matched again along the epipolar lines."""
-    found = []
-    intrinsics = mapping.intrinsics
-    for pair in pairs:
-        a, b = pair.view_a, pair.view_b
-        rotation = mapping.rotations[b] @ mapping.rotations[a].T
-        translation = mapping.translations[b] - rotation @ mapping.translations[a]
-        common = int((mapping.active[:, a] & mapping.active[:, b]).sum())
-        if not (mapping.registered[a] and mapping.registered[b]) or common < _MIN_COMMON:
-            found.append(pair)
-            continue
-        fundamental = fundamental_from_poses(rotation, translation, intrinsics[a], intrinsics[b])
-        found.append(match_guided(pair, features, fundamental, config, unit_px=mapping.unit_px))
-    return found
-
-
-def _on_all_tracks(
-    model: Mapping, tracks: Tracks, start: FocalStart, plan: LensPlan, config: SfmConfig, setup: Setup
-) -> Mapping:
-    """The same cameras over all tracks."""
-    full = _new_mapping(tracks, start, plan, config, setup)
-    full.adopt(model)
-    return full
-
-
-def _set_known_poses(mapping: Mapping, known: KnownCameras) -> None:
-    """Register the views whose pose was given."""
-    mapping.rotations[:] = known.cam_from_world[:, :3, :3]
-    mapping.translations[:] = known.cam_from_world[:, :3, 3]
-    mapping.registered = known.posed.copy()
-
-
-def _free_views(mapping: Mapping, known: KnownCameras, config: SfmConfig) -> Bool[np.ndarray, " view"] | None:
-    """Cameras that adjustment may move; None leaves the choice of the reference to the mapping."""
-    if not known.posed.any():
-        return None
-    free = ~known.posed
-    if config.refine_known_poses:
-        free[:] = True
-        free[np.flatnonzero(known.posed)[0]] = False
-    return free
-
-
-def _initial_pairs(
-    features: list[Features],
-    pairs: list[PairMatches],
-    kinds: list[PairKind],
-    plan: LensPlan,
-    config: SfmConfig,
-    setup: Setup,
-) -> list[PairMatches | None]:
-    """The most promising pairs to begin with: inliers x triangulation angle, capped; of the main lens where there are such.
-
-    No view is in all of them where that can be: one view with another lens than it seems to have must not spoil every start.
-    """
-    scored: list[tuple[bool, float, PairMatches]] = []
-    for pair, kind in zip(pairs, kinds, strict=True):
-        if kind is not PairKind.PARALLAX:
-            continue
-        a, b = pair.view_a, pair.view_b
-        pose = relative_pose(
-            features[a].pixel_xy[pair.verified.index_a],
-            features[b].pixel_xy[pair.verified.index_b],
-            plan.nominal[a],
-            plan.nominal[b],
-            threshold_px=config.epipolar_px * setup.unit_px,
-            seed=setup.seed,
-        )
-        if pose is not None and pose.angle_deg > config.min_angle_deg:
-            alike = plan.lens_of[a] == plan.lens_of[b] == plan.main
-            value = float(pose.inlier.sum()) * min(pose.angle_deg, config.max_initial_angle_deg)
-            scored.append((alike, value, pair))
-    scored.sort(key=lambda entry: (not entry[0], -entry[1]))
-    ranked = [pair for _, _, pair in scored]
-    chosen = ranked[: config.initial_pairs]
-    for view in (chosen[0].view_a, chosen[0].view_b) if chosen else ():
-        if all(view in (pair.view_a, pair.view_b) for pair in chosen):
-            chosen += [pair for pair in ranked if view not in (pair.view_a, pair.view_b)][:1]
-    return list(chosen)
-
-
-def _set_initial_pair(mapping: Mapping, features: list[Features], pair: PairMatches, config: SfmConfig) -> bool:
-    """Start the model from one pair; False if it has no motion at this focal."""
-    a, b = pair.view_a, pair.view_b
-    pose = relative_pose(
-        features[a].pixel_xy[pair.verified.index_a],
-        features[b].pixel_xy[pair.verified.index_b],
-        mapping.intrinsics[a],
-        mapping.intrinsics[b],
-        threshold_px=config.epipolar_px * mapping.unit_px,
-        seed=mapping.seed,
-    )
-    if pose is None:
-        return False
-    mapping.start(a, b, pose)
-    return True
+    return PairKinds(kinds=kinds, distinct=distinct, turning_focal=float(np.median(factors)) if factors else None)

@@ -154,7 +154,7 @@ def _view_report(
     lens = mapping.lenses.resolved[mapping.lens_of[view]]
     shift = (float(lens[SHIFT_X]), float(lens[SHIFT_Y]))
     k = (0.0, 0.0) if distortion is None else (float(distortion.k[view, 0]), float(distortion.k[view, 1]))
-    shared = mapping.lenses.focal_of[mapping.lens_of[view]] == mapping.lens_of[plan.main]
+    shared = mapping.lenses.focal_of[mapping.lens_of[view]] == mapping.lens_of[mapping.main]
     ratio = float(mapping.intrinsics[view, 0, 0] / mapping.shift_unit_px[view, 0])
     return ViewReport(
         view=view,
@@ -191,7 +191,7 @@ def _view_warnings(
     if not mapping.registered[view] or plan.generated[view]:
         return ()
     said = []
-    main_ratio = float(mapping.intrinsics[plan.main, 0, 0] / mapping.shift_unit_px[plan.main, 0])
+    main_ratio = float(mapping.intrinsics[mapping.main, 0, 0] / mapping.shift_unit_px[mapping.main, 0])
     if not shared and plan.lens_of[view] == plan.main:
         said.append(
             f"its focal length is {ratio / main_ratio:.2f} times that of the others, as far as the pictures tell"
