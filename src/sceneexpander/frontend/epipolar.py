@@ -26,6 +26,7 @@ _PRIOR_INFLATION = 8.0  # as in mapping: that many correlated errors count as on
 class OtherView:
     """A camera that is believed (cam_from_world), and its matches with the view in question."""
 
+    view: int
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, " 3"]
     intrinsics: Float[np.ndarray, "3 3"]

@@ -113,6 +113,7 @@ def other_views(
         if mapping.registered[other]:
             found.append(
                 OtherView(
+                    view=other,
                     rotation=mapping.rotations[other],
                     translation=mapping.translations[other],
                     intrinsics=mapping.intrinsics[other],

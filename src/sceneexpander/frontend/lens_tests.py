@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
-from sceneexpander.frontend.bundle import K1, K2, LOG_FOCAL, SHIFT_X, SHIFT_Y, BundleResult
+from sceneexpander.frontend.bundle import K1, K2, LENS_PARAMETERS, LOG_FOCAL, SHIFT_X, SHIFT_Y, BundleResult
 from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, LensFreedom, OtherView, freedom_of, held_lens
 from sceneexpander.frontend.evidence import other_views
@@ -26,7 +27,9 @@ _log = logging.getLogger(__name__)
 _MIN_MATCHES = 60  # of a view with all others: fewer say too little about its lens
 _NOISE_PX = 0.5  # at 768 px: of matches, for their distance from epipolar lines
 _STANDS_OUT = 1.25  # times the usual share of what stays unexplained
-_ODD = 1.6  # times the usual: views that are left out, and brought back by the cameras of the others
+_APART = 2.0  # times what stays unexplained within two groups of views: so much between them sets them apart
+_MOST_DIVIDED = 10  # views
+_MIN_PAIR_MATCHES = 20
 _SNAP = 0.05  # of the logarithm of the focal
 _KEEP_BEST = 4  # poses at other focals that are refined
 _OWN_FOCAL = 0.04  # of the logarithm: nearer to the shared focal than this nothing is gained by another
@@ -69,20 +72,60 @@ def settle_lenses(mapping: Mapping, features: Sequence[Features], pairs: Sequenc
     return False
 
 
-def find_odd_views(mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches]) -> list[int]:
-    """Views of which much more stays unexplained than is usual, worst first; so few that at least three are left."""
-    seen = {view: other_views(mapping, view, features, pairs) for view in np.flatnonzero(mapping.registered).tolist()}
-    costs = {
-        view: _LensCheck(mapping, view, others).now.cost
-        for view, others in seen.items()
-        if sum(len(other.own_xy) for other in others) >= _MIN_MATCHES
-    }
-    if len(costs) < 4:
+def find_apart_group(mapping: Mapping, costs: Float[np.ndarray, "view view"]) -> list[int]:
+    """The smaller of two groups of views that explain their own matches and not those between them; empty if there are no such groups.
+
+    Photos of two lenses taken for one look like that. Every division is tried, so for more than ten views none is.
+
+    Args:
+        mapping: finished model.
+        costs: of `pair_costs`.
+    """
+    views = np.flatnonzero(mapping.registered).tolist()
+    if not 4 <= len(views) <= _MOST_DIVIDED:
         return []
-    # The usual is that of the better half: the odd ones spoil some matches of every other view.
-    usual = float(np.median(sorted(costs.values())[: (len(costs) + 1) // 2 + 1]))
-    odd = sorted((view for view, cost in costs.items() if cost > _ODD * usual), key=lambda view: -costs[view])
-    return odd[: len(costs) - 3]
+    best: tuple[float, list[int]] = (_APART, [])
+    for code in range(1, 2 ** (len(views) - 1)):
+        one = [view for k, view in enumerate(views) if code >> k & 1]
+        other = [view for view in views if view not in one]
+        small, large = sorted((one, other), key=len)
+        if len(large) < 3:
+            continue
+        within = [costs[a, b] for group in (small, large) for a in group for b in group if a < b]
+        inner = float(np.nanmean(within)) if np.isfinite(within).any() else float("nan")
+        between = costs[np.ix_(small, large)]
+        if not np.isfinite(inner) or np.isfinite(between).sum() < 2:
+            continue
+        ratio = float(np.nanmean(between)) / max(inner, 1e-6)
+        if ratio > best[0]:
+            best = ratio, small
+    _log.debug("pair costs\n%s\napart %s (%.1f)", costs.round(3), best[1], best[0])
+    return best[1]
+
+
+def mean_cost(costs: Float[np.ndarray, "view view"]) -> float:
+    """Over all pairs; 1 without any."""
+    return float(np.nanmean(costs)) if np.isfinite(costs).any() else 1.0
+
+
+def pair_costs(
+    mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches]
+) -> Float[np.ndarray, "view view"]:
+    """What stays unexplained of each pair's matches; NaN where there are too few."""
+    views = len(mapping.registered)
+    costs = np.full((views, views), np.nan)
+    for view in np.flatnonzero(mapping.registered).tolist():
+        for other in other_views(mapping, view, features, pairs):
+            if len(other.own_xy) >= _MIN_PAIR_MATCHES and np.isnan(costs[view, other.view]):
+                fit = EpipolarFit(
+                    [other],
+                    mapping.intrinsics[view],
+                    np.ones(2),
+                    noise_px=_NOISE_PX * mapping.unit_px,
+                )
+                cost = fit.judge(mapping.rotations[view], mapping.translations[view], np.zeros(LENS_PARAMETERS)).cost
+                costs[view, other.view] = costs[other.view, view] = cost
+    return costs
 
 
 def snap_lenses(mapping: Mapping) -> bool:

@@ -14,7 +14,7 @@ from jaxtyping import Bool
 
 from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
 from sceneexpander.frontend.features import Features
-from sceneexpander.frontend.lens_tests import find_odd_views, settle_lenses, snap_lenses
+from sceneexpander.frontend.lens_tests import find_apart_group, mean_cost, pair_costs, settle_lenses, snap_lenses
 from sceneexpander.frontend.lenses import FocalStart, LensPlan
 from sceneexpander.frontend.mapping import CropOfMain, Mapping
 from sceneexpander.frontend.sfm_setup import KnownCameras, Setup
@@ -29,6 +29,10 @@ from sceneexpander.frontend.twoview import (
 
 _log = logging.getLogger(__name__)
 
+_STRANGE = (
+    3.0  # times what is usual among the others: a view that even a lens of its own does not bring together with them
+)
+_BETTER = 0.8  # of what stayed unexplained before
 _MIN_COMMON = 8  # points two views must share before their matches are worth finding again
 
 
@@ -62,7 +66,7 @@ class CameraSearch:
             return self._without_points(tracks)
         model, start, refine, attempted = self._settled(tracks, *begun)
         if refine and not self.known.posed.any():
-            model = self._with_odd_views_apart(tracks, model)
+            model = self._with_groups_apart(tracks, model)
         # Only now: matches found again in the epipolar bands of a wrong camera would only agree with it.
         if config.guided:
             again = build_tracks(self.features, self._guided_pairs(model))
@@ -145,39 +149,39 @@ class CameraSearch:
             refine = self._finish(model, refine)
         return model, start, refine, attempted
 
-    def _with_odd_views_apart(self, tracks: Tracks, model: Mapping) -> Mapping:
-        """The model, or one made without the views that stand out and with those brought back, each with a lens of its own."""
-        odd = find_odd_views(model, self.features, self.pairs)
-        if not odd:
+    def _with_groups_apart(self, tracks: Tracks, model: Mapping) -> Mapping:
+        """The model, or a better one in which a group of views that does not go with the rest has a lens of its own."""
+        costs = pair_costs(model, self.features, self.pairs)
+        group = find_apart_group(model, costs)
+        if not group:
             return model
         seen = tracks.seen.copy()
-        seen[:, odd] = False
-        rest = self.without(odd)
-        begun = rest._best_start(Tracks(pixel_xy=tracks.pixel_xy, seen=seen))
+        seen[:, group] = False
+        fewer = Tracks(pixel_xy=tracks.pixel_xy, seen=seen)
+        rest = self.without(group)
+        begun = rest._best_start(fewer)
         if begun is None:
             return model
-        apart, start, refine, _ = rest._settled(Tracks(pixel_xy=tracks.pixel_xy, seen=seen), *begun)
+        apart, start, refine, _ = rest._settled(fewer, *begun)
         if not refine:
             return model
         whole = self._new_mapping(tracks, start)
         whole.adopt(apart)
-        for view in odd:
-            whole.split_lens(view)
-        for view in odd:
+        whole.split_lens(group[0])
+        whole.lens_of[group] = whole.lens_of[group[0]]
+        for view in group:
             whole.register(view)
         whole.grow(refine_focal=True)
         self._finish(whole, True)
-        for _ in range(self.config.lens_rounds):
-            freer = whole.copy()
-            if not settle_lenses(freer, self.features, self.pairs):
-                break
-            freer.grow(refine_focal=True)
-            self._finish(freer, True)
-            if freer.score() <= whole.score():
-                break
-            whole = freer
-        _log.debug("views %s apart: score %.1f -> %.1f", odd, model.score(), whole.score())
-        return whole if whole.score() > model.score() else model
+        now = pair_costs(whole, self.features, self.pairs)
+        others = [view for view in np.flatnonzero(whole.registered) if view not in group]
+        usual = mean_cost(now[np.ix_(others, others)])
+        for view in group:
+            if whole.registered[view] and mean_cost(now[view, others]) > _STRANGE * usual:
+                whole.leave_out(view)
+                now[view, :] = now[:, view] = np.nan
+        _log.debug("views %s apart: unexplained %.3f -> %.3f", group, mean_cost(costs), mean_cost(now))
+        return whole if mean_cost(now) < _BETTER * mean_cost(costs) else model
 
     def without(self, views: list[int]) -> CameraSearch:
         """The same search without what some views share with others."""

@@ -28,6 +28,7 @@ def noisy(world: worlds.PointWorld, seed: int = 0) -> worlds.PointWorld:
 def fit_of(world: worlds.PointWorld, view: int) -> EpipolarFit:
     others = [
         OtherView(
+            view=other,
             rotation=world.rotations[other],
             translation=world.translations[other],
             intrinsics=world.intrinsics[other],
