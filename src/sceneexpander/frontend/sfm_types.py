@@ -38,7 +38,9 @@ class SfmConfig:
 
     # Features and matches.
     max_features: Annotated[int, Range(1, 1_000_000)] = 4000  # strongest kept per view
-    contrast_threshold: Share = 0.01  # SIFT's default of 0.04 leaves plain rooms with a few hundred features
+    contrast_threshold: Annotated[float, Range(0, 100)] = (
+        0.01  # SIFT's default of 0.04 leaves plain rooms with a few hundred features
+    )
     upsample_below_px: Annotated[int, Range(0, 100_000)] = (
         700  # images with a shorter long side are enlarged 2x before detection
     )
@@ -140,15 +142,12 @@ class SfmConfig:
 
     # Evidence that a camera must have.
     min_agreeing: Share = 0.5  # share of a view's verified matches that agree with the model
-    max_rotation_gap_deg: Annotated[float, Range(0, 180)] = (
-        8.0  # between the model's relative rotations and those of single pairs (median over pairs)
-    )
-    max_direction_deg: Annotated[float, Range(0, 180)] = (
-        6.0  # predicted error of directions (standard deviation, median): beyond it a camera is rough
-    )
-    max_own_direction_deg: Annotated[float, Range(0, 180)] = (
-        1.0  # the same for a view whose focal only the pictures tell: beyond it it is left out
-    )
+    # Between the model's relative rotations and those of single pairs, whose planes and few matches make them rough: median over pairs.
+    max_rotation_gap_deg: Annotated[float, Range(0, 180)] = 20.0
+    # Predicted error of directions (standard deviation, median over the other views): beyond it a camera is rough.
+    max_direction_deg: Annotated[float, Range(0, 180)] = 6.0
+    # A view of its own focal is left out if that leaves the directions to others more open than this.
+    max_own_direction_deg: Annotated[float, Range(0, 180)] = 2.0
     refine_known_poses: bool = False  # True: given poses are a start, not the truth
     refine_known_intrinsics: bool = False  # True: a shared factor on the given focals is refined
 
