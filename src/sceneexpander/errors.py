@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import sys
+import unicodedata
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
@@ -12,6 +13,7 @@ from typing import TypeVar
 Result = TypeVar("Result")
 
 EXIT_BAD_INPUT = 2
+_TURNING = frozenset("\u200e\u200f\u061c\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
 class UserError(Exception):
@@ -30,17 +32,37 @@ class UserError(Exception):
         super().__init__(self.line())
 
     def line(self) -> str:
-        """The message as one line: ``where: problem; fix``."""
-        text = self.problem if self.where is None else f"{self.where}: {self.problem}"
-        if self.fix:
-            text = f"{text}; {self.fix}"
-        return " ".join(text.split())
+        """The message as one line: ``where: problem; fix``, without anything that a terminal would obey."""
+        text = self.problem if not self.fix else f"{self.problem}; {self.fix}"
+        line = printable(" ".join(text.split()))
+        return line if self.where is None else f"{printable(self.where)}: {line}"
+
+
+def printable(text: str) -> str:
+    """``text`` on one line, with everything escaped that a terminal would obey or could not show (``a\\nb``, ``\\x1b``, ``\\xff``).
+
+    Control characters, line breaks, marks that turn the direction of writing, and bytes of names that are not valid text.
+    """
+    return "".join(letter if _is_plain(letter) else _escaped(letter) for letter in text)
+
+
+def _is_plain(letter: str) -> bool:
+    return letter not in _TURNING and unicodedata.category(letter) not in ("Cc", "Cs", "Zl", "Zp")
+
+
+def _escaped(letter: str) -> str:
+    code = ord(letter)
+    if 0xDC80 <= code <= 0xDCFF:
+        return f"\\x{code - 0xDC00:02x}"  # how Python keeps a byte of a file name that is not UTF-8
+    return repr(letter)[1:-1]
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """What to do about an unknown word: the nearest known one, or all of them. Meant for `UserError.fix`."""
     choices = sorted(known)
-    close = difflib.get_close_matches(word, choices, n=1, cutoff=0.6)
+    # Another case is the nearest of all, although letter by letter it may have nothing in common.
+    same = [choice for choice in choices if choice.casefold() == word.casefold()]
+    close = same or difflib.get_close_matches(word, choices, n=1, cutoff=0.6)
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(choices)}"
 
 

@@ -11,7 +11,10 @@ from sceneexpander.artifacts.store import sha256_of_bytes
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.generation.protocol import Candidate, GenerationContext, ViewGenerator
-from sceneexpander.ingest.listing import list_pictures, require_inside
+from sceneexpander.ingest.decode import LIMIT_BYTES
+from sceneexpander.ingest.links import require_inside
+from sceneexpander.ingest.survey import list_pictures
+from sceneexpander.plainfiles import read_plain_file
 
 
 def make_generator(context: GenerationContext) -> ViewGenerator:
@@ -78,10 +81,7 @@ BACKENDS: dict[str, Callable[[GenerationContext], ViewGenerator]] = {
 
 
 def _stored(path: Path, folder: Path, backend: str, prompt: str, references: ViewSet) -> Candidate:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"cannot be read ({error.strerror})", where=path) from None
+    data = read_plain_file(path, limit_bytes=LIMIT_BYTES)
     provenance = Provenance(
         backend=backend,
         prompt=prompt,

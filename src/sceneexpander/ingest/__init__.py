@@ -3,9 +3,10 @@
 from sceneexpander.ingest.config import Fit, IngestConfig
 from sceneexpander.ingest.decode import Picture, decode_picture, read_picture
 from sceneexpander.ingest.fit import FittedPicture, FrameSize, common_frame, fit_picture
-from sceneexpander.ingest.listing import list_pictures, safe_name
+from sceneexpander.ingest.listing import safe_name, scene_files
 from sceneexpander.ingest.load import LoadedViews, load_photos, load_scene, read_views
 from sceneexpander.ingest.scene_file import make_round
+from sceneexpander.ingest.survey import Survey, list_pictures, survey_pictures
 
 __all__ = [
     "Fit",
@@ -14,6 +15,7 @@ __all__ = [
     "IngestConfig",
     "LoadedViews",
     "Picture",
+    "Survey",
     "common_frame",
     "decode_picture",
     "fit_picture",
@@ -24,4 +26,6 @@ __all__ = [
     "read_picture",
     "read_views",
     "safe_name",
+    "scene_files",
+    "survey_pictures",
 ]

@@ -19,6 +19,8 @@ from PIL import Image, ImageOps
 
 from sceneexpander.artifacts.store import sha256_of_bytes
 from sceneexpander.errors import UserError
+from sceneexpander.ingest.formats import PILLOW_FORMATS, missing_decoder, name_of_content, sniff_format
+from sceneexpander.plainfiles import read_plain_file
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -27,7 +29,7 @@ _EXIF_IFD = 0x8769
 _EXIF_FOCAL_35MM = 0xA405
 _DIAGONAL_35MM = float(np.hypot(36.0, 24.0))
 _ALPHA_MODES = {"LA", "La", "PA", "RGBA", "RGBa"}
-_HEIF_BRANDS = {b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1"}
+LIMIT_BYTES = 512 * 2**20  # of a picture file
 # What Pillow raises for damaged files depends on the format and on where the damage is.
 _DECODE_ERRORS = (
     OSError,
@@ -65,26 +67,6 @@ class Picture:
         return int(self.pixels.shape[1])
 
 
-def sniff_format(head: bytes) -> str | None:
-    """The picture format that the first bytes announce (Pillow's name, or ``HEIF``), or None."""
-    if head.startswith(b"\xff\xd8\xff"):
-        return "JPEG"
-    if head.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "PNG"
-    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
-        return "WEBP"
-    if head[:6] in (b"GIF87a", b"GIF89a"):
-        return "GIF"
-    if head[:4] in (b"II*\0", b"MM\0*"):
-        return "TIFF"
-    if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
-        return "HEIF"
-    # "BM" is two letters only: the reserved words and the header length must fit as well.
-    if head[:2] == b"BM" and len(head) >= 18 and head[6:10] == bytes(4) and head[15:18] == bytes(3):
-        return "BMP"
-    return None
-
-
 def read_picture(path: Path, *, max_megapixels: float = 200.0) -> Picture:
     """Read and decode one picture file (the first frame of an animated one).
 
@@ -106,12 +88,7 @@ def read_picture_shape(path: Path, *, max_megapixels: float = 200.0) -> tuple[in
 
 
 def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise UserError("does not exist", where=path) from None
-    except OSError as error:
-        raise UserError(f"cannot be read ({error.strerror or error})", where=path) from None
+    return read_plain_file(path, limit_bytes=LIMIT_BYTES)
 
 
 def decode_picture(data: bytes, *, name: str, where: str | Path, max_megapixels: float = 200.0) -> Picture:
@@ -131,15 +108,13 @@ def decode_picture(data: bytes, *, name: str, where: str | Path, max_megapixels:
 def _checked_format(data: bytes, where: str | Path) -> str:
     if not data:
         raise UserError("is empty (0 bytes)", where=where, fix="copy the picture again or remove it")
-    file_format = sniff_format(data[:32])
+    file_format = sniff_format(data[:64])
     if file_format is None:
         _refuse_unknown(data, where)
-    if file_format == "HEIF":
-        raise UserError(
-            "is a HEIC/HEIF picture, which cannot be decoded here",
-            where=where,
-            fix="convert it to JPEG or PNG (the Python package pillow-heif can do it)",
-        )
+    missing = missing_decoder(file_format)
+    if missing is not None:
+        name = "HEIC/HEIF" if file_format == "HEIF" else file_format
+        raise UserError(f"is a {name} picture, which cannot be decoded here", where=where, fix=missing)
     return file_format
 
 
@@ -151,6 +126,11 @@ def _refuse_unknown(data: bytes, where: str | Path) -> NoReturn:
             "is a raw float32 depth map (ETH3D names its ground-truth depth .JPG), not a picture",
             where=where,
             fix="point the scene at the folder of photos, not at ground_truth_depth",
+        )
+    name = name_of_content(data[:64])
+    if name is not None:
+        raise UserError(
+            f"is not a picture but {name}", where=where, fix="use JPEG, PNG, WebP, BMP or TIFF, or remove the file"
         )
     raise UserError(
         f"is not a picture (its first bytes are {data[:8].hex(' ')})",
@@ -171,7 +151,7 @@ def _looks_like_depth_dump(data: bytes) -> bool:
 
 
 def _open(data: bytes, file_format: str, where: str | Path, max_megapixels: float) -> Image.Image:
-    formats = ["JPEG", "MPO"] if file_format == "JPEG" else [file_format]
+    formats = PILLOW_FORMATS.get(file_format, [file_format])
     try:
         with _open_lock:
             # Pillow's own limit is a global and lower than ours; sizes are checked here, before any pixel is decoded.

@@ -1,4 +1,4 @@
-"""Which files of a folder are its pictures, in which order, and under which safe names."""
+"""Which files of a scene folder the pipeline needs, and names that are safe everywhere."""
 
 from __future__ import annotations
 
@@ -7,60 +7,55 @@ import unicodedata
 from pathlib import Path
 
 from sceneexpander.errors import UserError
+from sceneexpander.ingest.links import require_inside
+from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file
+from sceneexpander.ingest.survey import list_pictures
+from sceneexpander.plainfiles import list_folder, require_plain_file
 
-PICTURE_EXTENSIONS = frozenset({"jpg", "jpeg", "png", "webp", "bmp", "tif", "tiff"})
-# Listed although they cannot be decoded, so that they are refused with a reason and not passed over in silence.
-_REFUSED_EXTENSIONS = frozenset({"heic", "heif"})
+TRUTH_FOLDER = "truth"
 _SAFE_LENGTH = 48
+_MOST_TRUTH_FILES = 1000
 
 
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key in which numbers compare as numbers: ``view_2`` comes before ``view_10``. Letter case does not matter."""
-    parts = re.split(r"([0-9]+)", name.casefold())
-    key = tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part)
-    return (*key, (-1, 0, name))  # names that differ only in case or leading zeros keep one order everywhere
+def scene_files(folder: Path) -> list[Path]:
+    """Every file of a scene folder that the pipeline needs: what a copy of the scene must hold, and all that it needs to.
 
-
-def list_pictures(folder: Path, *, inside: Path | None = None) -> list[Path]:
-    """The picture files directly in ``folder``, in natural order.
-
-    Extensions are compared without case. Hidden files (also ``._`` companions), folders and files of other kinds are left out.
-
-    Args:
-        folder: where to look.
-        inside: files that resolve (through symbolic links) to a place outside this folder are refused; default ``folder``.
+    These are ``scene.yaml``, the captured photos, the pictures to insert (with all candidates) and everything below ``truth/``. Paths
+    start with ``folder``; links are followed only where `sceneexpander.ingest.links` allows it, and each path leads to a plain file.
 
     Raises:
-        UserError: the folder does not exist, holds no pictures, or links out of ``inside``.
+        UserError: one line about a file that is missing, leads out of the folder or is no plain file, or what is wrong in ``scene.yaml``.
     """
-    if not folder.is_dir():
-        problem = "is a file, expected a folder of pictures" if folder.exists() else "does not exist"
-        raise UserError(problem, where=folder)
-    wanted = PICTURE_EXTENSIONS | _REFUSED_EXTENSIONS
-    found = [
-        path
-        for path in folder.iterdir()
-        if not path.name.startswith(".") and path.suffix[1:].casefold() in wanted and not path.is_dir()
-    ]
-    if not found:
-        raise UserError(
-            "holds no pictures", where=folder, fix=f"expected files named .{', .'.join(sorted(PICTURE_EXTENSIONS))}"
-        )
-    root = folder if inside is None else inside
-    return [require_inside(path, root) for path in sorted(found, key=lambda path: natural_key(path.name))]
+    facts = read_scene_file(folder)
+    images = require_inside(folder / facts.images, folder, where=f"{folder / SCENE_FILE}: 'images'")
+    files = [folder / SCENE_FILE, *list_pictures(images, inside=folder)]
+    for spec in facts.rounds:
+        if spec.inserted is not None:
+            target = folder / spec.inserted
+            files += list_pictures(target, inside=folder) if target.is_dir() else [target]
+    truth = folder / TRUTH_FOLDER
+    if truth.is_dir():
+        files += _truth_files(require_inside(truth, folder), folder)
+    for path in files:
+        require_plain_file(require_inside(path, folder))
+    return list(dict.fromkeys(files))
 
 
-def require_inside(path: Path, folder: Path, *, where: str | None = None) -> Path:
-    """``path`` itself, unless it resolves to a place outside ``folder`` (by ``..`` or a symbolic link).
-
-    ``where`` is what the error names instead of the path.
-    """
-    if not path.resolve().is_relative_to(folder.resolve()):
-        how = "is a link that leads" if path.is_symlink() else "leads"
-        if where is not None:
-            how = f"{path.name} {how}"
-        raise UserError(f"{how} out of {folder}", where=where or path, fix="copy the file into the scene folder")
-    return path
+def _truth_files(truth: Path, folder: Path) -> list[Path]:
+    found: list[Path] = []
+    waiting = [truth]
+    while waiting:
+        for path in list_folder(waiting.pop()):
+            if path.name.startswith("."):
+                continue
+            require_inside(path, folder)
+            if path.is_dir() and not path.is_symlink():
+                waiting.append(path)
+            else:
+                found.append(path)
+        if len(found) + len(waiting) > _MOST_TRUTH_FILES:
+            raise UserError(f"holds more than {_MOST_TRUTH_FILES} files", where=truth)
+    return sorted(found)
 
 
 def safe_name(text: str, *, fallback: str = "view") -> str:

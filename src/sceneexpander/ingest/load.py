@@ -19,8 +19,10 @@ from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.decode import Picture, Pixels, read_picture, read_picture_shape
 from sceneexpander.ingest.fit import FittedPicture, common_frame, fit_picture
-from sceneexpander.ingest.listing import list_pictures, require_inside, safe_name
-from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file
+from sceneexpander.ingest.links import require_inside
+from sceneexpander.ingest.listing import safe_name
+from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file, same_name
+from sceneexpander.ingest.survey import list_pictures
 
 logger = logging.getLogger(__name__)
 
@@ -144,12 +146,16 @@ def _scene(paths: list[Path], rounds: tuple[RoundSpec, ...], config: IngestConfi
 
 def _ordered(paths: list[Path], order: tuple[str, ...], scene_file: Path) -> list[Path]:
     by_name = {path.name: path for path in paths}
+    alike = {same_name(path.name): path.name for path in paths}
+    first: list[str] = []
     for name in order:
-        if name not in by_name:
+        found = name if name in by_name else alike.get(same_name(name))
+        if found is None:
             raise UserError(
                 f"'order' names {name!r}, which is not there", where=scene_file, fix=did_you_mean(name, by_name)
             )
-    return [by_name[name] for name in order] + [path for path in paths if path.name not in order]
+        first.append(found)
+    return [by_name[name] for name in first] + [path for path in paths if path.name not in first]
 
 
 def _check_count(count: int, paths: Sequence[Path], config: IngestConfig, *, distinct: str = "") -> None:

@@ -113,7 +113,7 @@ def test_own_file(folder: Path, tmp_path: Path) -> None:
     assert inserted.provenance[0].backend == "file"
     assert inserted.provenance[0].source == "mine_3.webp"  # no path of the user's machine is recorded
     assert "generator.file: is not set" in refusal(folder, 3, backend="file")
-    assert "cannot be read" in refusal(folder, 3, backend="file", file=str(tmp_path / "none.png"))
+    assert "none.png: does not exist" in refusal(folder, 3, backend="file", file=str(tmp_path / "none.png"))
     assert "is a folder" in refusal(folder, 3, backend="file", file=str(tmp_path))
 
 

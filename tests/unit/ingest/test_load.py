@@ -13,7 +13,7 @@ from PIL import Image
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.errors import UserError
 from sceneexpander.ingest import IngestConfig, list_pictures, load_photos, load_scene, make_round, read_views, safe_name
-from sceneexpander.ingest.listing import natural_key
+from sceneexpander.ingest.survey import natural_key
 
 CONFIG = IngestConfig(long_side_px=56)
 ROUNDS = [make_round("A wooden bench stands behind the table.")]
@@ -128,7 +128,7 @@ def test_order(tmp_path: Path) -> None:
 
 def test_images_folder_can_be_named(tmp_path: Path) -> None:
     folder = scene_folder(tmp_path, "rounds: [{prompt: A cat.}]\nimages: photos\n")
-    assert "photos: does not exist" in refusal(folder)
+    assert "names photos, which does not exist" in refusal(folder)
     (folder / "captured").rename(folder / "photos")
     assert len(load_scene(folder, CONFIG).views) == 2
     (folder / "scene.yaml").write_text("rounds: [{prompt: A cat.}]\nimages: ../elsewhere\n")
