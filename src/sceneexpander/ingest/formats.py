@@ -54,6 +54,7 @@ _VIDEO_BRANDS = {
     b"3gp5",
 }
 # What is missing where Pillow alone does not read a format, and the package that adds it.
+DYNAMIC_IMPORTS = ()  # of ours; decoders are other people's packages
 _PLUGINS = {"HEIF": ("pillow_heif", "pillow-heif"), "JPEG XL": ("pillow_jxl", "pillow-jxl-plugin")}
 _FEATURES = {"AVIF": "avif", "JPEG2000": "jpg_2000", "WEBP": "webp"}
 # Pillow's names of what may come out where one of ours was found.
