@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from sceneexpander.config.overrides import environment_hidden
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import did_you_mean
@@ -35,7 +36,7 @@ def compose(conf: Path, overrides: Sequence[str]) -> dict[str, Any]:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    with _initialised(conf):
+    with environment_hidden(), _initialised(conf):
         try:
             composed = hydra_compose(config_name="config", overrides=list(overrides))
             plain = OmegaConf.to_container(composed, resolve=True)

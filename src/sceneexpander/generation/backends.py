@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +69,8 @@ class FileGenerator:
         given = self.context.config.file
         if not given:
             raise UserError("is not set", where="generator.file", fix="give the path of your picture")
-        path = Path(given.replace("{round}", str(self.context.round_number))).expanduser()
+        named = given if os.path.isfile(given) else given.replace("{round}", str(self.context.round_number))
+        path = Path(os.path.expanduser(named))  # unlike Path's own, no error for a "~name" that is nobody's home
         if path.is_dir():
             raise UserError(f"{path} is a folder", where="generator.file", fix="give the path of one picture")
         return [_stored(path, path.parent, "file", prompt, references)]
