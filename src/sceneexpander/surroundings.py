@@ -8,9 +8,9 @@ where Python looks for modules, where git looks for its repository, and a login 
 from __future__ import annotations
 
 import getpass
+import io
 import os
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 from configobj import ConfigObj, ConfigObjError
@@ -80,19 +80,24 @@ def local_config(*, cache: Path | str | None, site: Path | None, no_scm: bool) -
     """
     core = {"no_scm": str(no_scm).lower()} | ({} if site is None else {"site_cache_dir": str(site)})
     content = {"core": core} | ({} if cache is None else {"cache": {"dir": str(cache)}})
-    where = f"{cache or site}"
+    lines = []
+    for section, values in content.items():
+        lines += [f"[{section}]", *(f"    {key} = {_quoted(value)}" for key, value in values.items())]
+    text = "\n".join(lines) + "\n"
     try:
-        text = "\n".join(_parser(content).write()) + "\n"
-        read = _parser(text.splitlines()).dict()
+        read = ConfigObj(io.StringIO(text)).dict()  # as DVC reads it
+        data = text.encode()
     except (ConfigObjError, UnicodeError):
-        read = None
+        read, data = None, b""
     if read != content:
-        raise UserError("cannot be written into DVC's configuration", where=where, fix="rename the folder")
-    return text.encode()
+        raise UserError("cannot be written into DVC's configuration", where=cache or site, fix="rename the folder")
+    return data
 
 
-def _parser(content: Mapping[str, object] | list[str]) -> ConfigObj:
-    return ConfigObj(content, encoding="utf-8" if isinstance(content, list) else None)
+def _quoted(value: str) -> str:
+    # Always: bare values lose spaces at their ends, also those that only Unicode knows.
+    mark = next((mark for mark in ('"', "'", "'''") if mark not in value), '"""')
+    return f"{mark}{value}{mark}"
 
 
 def is_under_version_control(project: Path) -> bool:
