@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_yaml
-from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, disk_full
+from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, disk_full, interruptible
 from sceneexpander.processes import end_with_parent
 from sceneexpander.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
 from stages import layout
@@ -77,6 +77,7 @@ def stage(*axes: str) -> Callable[[Callable[[Cell], None]], Callable[[], None]]:
 
         @functools.wraps(body)
         def main() -> None:
+            interruptible()
             if STAGE_ENV in os.environ:
                 end_with_parent()  # an orphan would write into folders that the next run writes to as well
             cell = _parse(name, axes)

@@ -6,6 +6,7 @@ import difflib
 import errno
 import functools
 import os
+import signal
 import sys
 import unicodedata
 from collections.abc import Callable, Iterable
@@ -93,6 +94,23 @@ def disk_full(error: BaseException) -> UserError | None:
     return None
 
 
+def quiet_start() -> None:
+    """Until `interruptible` an interrupt is one line and the end: imports take seconds, and nothing has been begun."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # neither ignored nor somebody else's
+        signal.signal(signal.SIGINT, _leave)
+
+
+def interruptible() -> None:
+    """From here on an interrupt is a `KeyboardInterrupt` again."""
+    if signal.getsignal(signal.SIGINT) is _leave:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _leave(*_: object) -> None:
+    os.write(2, b"interrupted\n")
+    os._exit(EXIT_INTERRUPTED)
+
+
 def entry_point(main: Callable[..., Result]) -> Callable[..., Result]:
     """Wrap a ``main`` so that what the user can mend ends as one line on stderr: a `UserError` or a full disk, with exit code 2.
 
@@ -101,6 +119,7 @@ def entry_point(main: Callable[..., Result]) -> Callable[..., Result]:
 
     @functools.wraps(main)
     def wrapped(*args: object, **kwargs: object) -> Result:
+        interruptible()
         # A terminal that cannot show a letter gets its number: a message must not fail for the name that it is about.
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):

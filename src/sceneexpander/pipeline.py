@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from sceneexpander.errors import interruptible
+
 RECORDED = Path("mlflow") / "tracked.json"  # what the last stage leaves: of every scene which runs are recorded
 
 
@@ -41,6 +43,7 @@ def ask_for_recording() -> None:
 
 def main() -> None:
     """Reproduce with DVC's own command line; its exit code is this program's."""
+    interruptible()
     from dvc.cli import main as dvc_main
 
     take_any_path()

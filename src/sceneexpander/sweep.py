@@ -105,7 +105,7 @@ def _axes(items: Sequence[str], conf: Path) -> dict[str, list[str]]:
         with environment_hidden(), initialize_config_dir(str(conf.resolve()), version_base="1.3"):
             loader = GlobalHydra.instance().config_loader()
             for item in items:
-                parsed = OverridesParser.create(config_loader=loader).parse_override(item)
+                (parsed,) = OverridesParser.create(config_loader=loader).parse_overrides([item])
                 if parsed.is_sweep_override():
                     if not parsed.is_discrete_sweep():
                         raise UserError("is a range without steps", where=item, fix="name the values: key=1,2,3")

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.config.overrides import key_of, written_out
-from sceneexpander.errors import UserError, printable
+from sceneexpander.errors import UserError, interruptible, printable
 from sceneexpander.processes import ended_by_signals, kept
 from sceneexpander.project import SWEEP_ENV, find_project
 from sceneexpander.selection import PARAMS, Selection
@@ -289,6 +289,7 @@ def run_stages(folder: Path, locks: Path) -> None:
 
 def main() -> None:
     """``python -m sceneexpander.workspace FOLDER``: what `reproduce_shared` starts."""
+    interruptible()
     folder = Path(sys.argv[1]).resolve()
     os.chdir(folder)
     run_stages(folder, find_project() / ".cache" / "locks")

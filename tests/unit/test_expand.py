@@ -269,12 +269,13 @@ def test_words_that_are_no_text_are_one_line(words: dict[str, Any], project: Pat
 
 
 def test_errors_name_the_users_files(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: str, folder: Path, **__: object) -> int:
-        raise UserError("is bad", where=folder / place)
-
-    monkeypatch.setattr(command, "check_scene", refuse)
     source = photos(tmp_path / "photos")
     for place, named in (("captured/1.png", source / "1.png"), ("inserted/round_1.png", tmp_path / "new.png")):
+
+        def refuse(_: str, folder: Path, *, place: str = place, **__: object) -> int:
+            raise UserError("is bad", where=folder / place)
+
+        monkeypatch.setattr(command, "check_scene", refuse)
         with pytest.raises(UserError) as caught:
             expand(request(source, tmp_path), project=project)
         assert caught.value.where == str(named)

@@ -205,9 +205,9 @@ def test_the_store_of_the_shell_is_not_taken(root: Path, monkeypatch: pytest.Mon
 
 
 def test_what_a_server_needs_stays() -> None:
-    shell = {"MLFLOW_TRACKING_TOKEN": "t", "MLFLOW_TRACKING_URI": "x", "MLFLOW_BACKEND_STORE_URI": "x", "PATH": "p"}
+    shell = {"MLFLOW_TRACKING_USERNAME": "t", "MLFLOW_TRACKING_URI": "x", "MLFLOW_BACKEND_STORE_URI": "x", "PATH": "p"}
     kept = without_foreign_settings(shell)
-    assert kept["MLFLOW_TRACKING_TOKEN"] == "t"
+    assert kept["MLFLOW_TRACKING_USERNAME"] == "t"
     assert kept["PATH"] == "p"
     assert not {"MLFLOW_TRACKING_URI", "MLFLOW_BACKEND_STORE_URI"} & set(kept)
     assert "MLFLOW_TRACKING_URI=x" in (ignored_note(shell) or "")
