@@ -10,6 +10,7 @@ from __future__ import annotations
 import getpass
 import io
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -95,7 +96,9 @@ def local_config(*, cache: Path | str | None, site: Path | None, no_scm: bool) -
 
 
 def _quoted(value: str) -> str:
-    # Always: bare values lose spaces at their ends, also those that only Unicode knows.
+    if re.fullmatch(r"[A-Za-z0-9_./-]+", value):
+        return value
+    # Whatever it is: bare values lose spaces at their ends, also those that only Unicode knows.
     mark = next((mark for mark in ('"', "'", "'''") if mark not in value), '"""')
     return f"{mark}{value}{mark}"
 

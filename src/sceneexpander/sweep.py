@@ -80,12 +80,16 @@ def check_axes(arguments: Sequence[str], project: Path) -> list[str]:
             raise UserError("is not a setting", where=item, fix="write key=value, e.g. ablation=baseline,full")
     items = list(written_out(given, absolute=True, sweep=True))
     base = read_selection(project).overrides
-    for item, values in _axes(items, project / "conf").items():
-        if key_of(item).partition("/")[0].partition(".")[0] == "hydra":
-            continue
-        for value in values:
-            key = item.partition("=")[0]
-            compose(project / "conf", merged_overrides(base, [f"{key}={value}"] if "=" in item else [item]))
+    axes = {
+        item: [f"{item.partition('=')[0]}={value}" if "=" in item else item for value in values]
+        for item, values in _axes(items, project / "conf").items()
+        if key_of(item).partition("/")[0].partition(".")[0] != "hydra"
+    }
+    # Every value once, beside the first ones of the other axes: what is wrong with one is wrong in any company.
+    first = {item: values[0] for item, values in axes.items()}
+    jobs = [tuple({**first, item: value}.values()) for item, values in axes.items() for value in values]
+    for job in dict.fromkeys(jobs):
+        compose(project / "conf", merged_overrides(base, job))
     return [*options, *items]
 
 

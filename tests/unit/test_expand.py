@@ -147,8 +147,8 @@ def test_a_child_that_lives_on_holds_the_lock(tmp_path: Path) -> None:
 def test_a_killed_start_leaves_no_child_and_no_lock(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     script = f"""
-import sys, time
 from pathlib import Path
+from sceneexpander.processes import kept
 from sceneexpander.workspace import run_lock
 with run_lock(Path({str(folder)!r})) as lock:
     with kept(["sleep", "60"], cwd=Path({str(tmp_path)!r}), held=(lock.descriptor,)) as process:
