@@ -86,7 +86,8 @@ def disk_full(error: BaseException) -> UserError | None:
     for one in chain:
         number = one.errno if isinstance(one, OSError) else None
         if number in _FULL or any(text in str(one).casefold() for text in _FULL_TEXTS):
-            name = one.filename if isinstance(one, OSError) else None
+            # The second name, where there are two, is what was written to.
+            name = (one.filename2 or one.filename) if isinstance(one, OSError) else None
             where = Path(os.fsdecode(name)).parent if isinstance(name, (str, bytes)) else Path.cwd()
             what = "the quota of this disk is used up" if number == errno.EDQUOT else "No space left on device"
             fix = "make room and start the same command again, it goes on with what is missing"

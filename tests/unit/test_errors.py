@@ -29,6 +29,7 @@ def chained(cause: BaseException) -> RuntimeError:
     ("error", "named"),
     [
         (OSError(errno.ENOSPC, "No space left on device", "/some/folder/file"), "/some/folder"),
+        (OSError(errno.ENOSPC, "No space left on device", "/from/file", None, "/some/folder/file"), "/some/folder"),
         (OSError(errno.EDQUOT, "Disk quota exceeded", "/some/folder/file"), "/some/folder"),
         (OSError(errno.ENOSPC, "No space left on device"), ""),
         (SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)"), ""),
