@@ -153,22 +153,34 @@ def run_lock(folder: Path, *, what: Path | None = None) -> Iterator[RunLock]:
         UserError: somebody else is at work there.
     """
     path = folder.with_name(f".{folder.name}.lock")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = _locked(path, folder if what is None else what, named=what is None)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(
-                f"is being worked on by {_at_work(descriptor)}",
-                where=what or folder,
-                fix="wait for it or end it" if what else "wait for it, end it, or choose another --name",
-            ) from None
         lock = RunLock(descriptor)
         lock.note(os.getpid())
         yield lock
     finally:
+        if not folder.exists():  # nothing came of it: not even a lock stays
+            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                path.parent.rmdir()
         os.close(descriptor)
+
+
+def _locked(path: Path, what: Path, *, named: bool) -> int:
+    """An open descriptor of the lock file, which is locked. ``named``: what it guards has a name that can be chosen."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
+                return descriptor
+        except BlockingIOError:
+            line = f"is being worked on by {_at_work(descriptor)}"
+            os.close(descriptor)
+            fix = "wait for it, end it, or choose another --name" if named else "wait for it or end it"
+            raise UserError(line, where=what, fix=fix) from None
+        os.close(descriptor)  # another process has taken the file away in between
 
 
 def _at_work(descriptor: int) -> str:

@@ -131,6 +131,7 @@ def test_a_second_start_changes_nothing(project: Path, tmp_path: Path) -> None:
 
 def test_a_child_that_lives_on_holds_the_lock(tmp_path: Path) -> None:
     folder = tmp_path / "run"
+    folder.mkdir()
     with run_lock(folder) as lock:
         inherited = subprocess.Popen(["sleep", "60"], pass_fds=(lock.descriptor,))
         lock.note(99999999, inherited.pid)
@@ -142,6 +143,12 @@ def test_a_child_that_lives_on_holds_the_lock(tmp_path: Path) -> None:
         inherited.wait()
     with run_lock(folder):
         pass
+
+
+def test_a_start_that_came_to_nothing_leaves_nothing(tmp_path: Path) -> None:
+    with run_lock(tmp_path / "runs" / "run"):
+        assert list((tmp_path / "runs").iterdir())
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_killed_start_leaves_no_child_and_no_lock(tmp_path: Path) -> None:
@@ -198,7 +205,7 @@ def test_links_bring_nothing_from_elsewhere(place: str, project: Path, tmp_path:
     path.symlink_to(private if path.suffix == "" else private / "0.png")
     with pytest.raises(UserError, match="leads out"):
         expand(Request(photos=folder), project=project)
-    assert not (project / "runs" / "mine").exists()
+    assert not (project / "runs").exists()
 
 
 def test_links_within_become_files(tmp_path: Path) -> None:
