@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sceneexpander.config.compose import compose
 from sceneexpander.config.overrides import environment_hidden, key_of, written_out
@@ -21,9 +21,14 @@ from sceneexpander.preflight import check_scene
 from sceneexpander.processes import run_group
 from sceneexpander.project import ROOT_ENV, find_project
 from sceneexpander.selection import read_selection
+from sceneexpander.typed import shorten
 from sceneexpander.workspace import make_workspace, merged_overrides, remove_tree, reproduce_shared
 
+if TYPE_CHECKING:
+    from hydra.core.override_parser.types import Override
+
 INNER_ENV = "SCENEEXPANDER_SWEEP_RUNS"  # set in the process that runs Hydra, which ends with the one that the user sees
+MOST_VALUES = 1000  # of one key: each is a run of its own
 KEPT = ("outputs/report", "outputs/pages", "params.yaml", "dvc.lock")  # of a finished job; the rest is in the cache
 
 
@@ -113,7 +118,7 @@ def _axes(items: Sequence[str], conf: Path) -> dict[str, list[str]]:
                 if parsed.is_sweep_override():
                     if not parsed.is_discrete_sweep():
                         raise UserError("is a range without steps", where=item, fix="name the values: key=1,2,3")
-                    values = list(parsed.sweep_string_iterator())
+                    values = _values(parsed, item)
                     if not values:
                         raise UserError("stands for no value", where=item, fix="see the files of conf/")
                 else:
@@ -127,10 +132,34 @@ def _axes(items: Sequence[str], conf: Path) -> dict[str, list[str]]:
                 OmegaConf.to_container(composed.hydra[key], resolve=False)
             if any("oc.env" in text for text in own):
                 raise ConfigError("would read an environment variable", where=item, fix="write the value itself")
-    except (HydraException, OmegaConfBaseException, OSError) as error:
+    except RecursionError:
+        raise UserError("is nested too deeply", where=shorten(item)) from None
+    # Beside its own errors, Hydra's parser lets those of very long and very large numbers through.
+    except (
+        HydraException,
+        OmegaConfBaseException,
+        OSError,
+        ValueError,
+        TypeError,
+        LookupError,
+        ArithmeticError,
+    ) as error:
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise UserError(first.strip(), where=item or "sceneexpander.sweep") from None
+        raise UserError(shorten(first.strip(), 200), where=shorten(item) or "sceneexpander.sweep") from None
     return found
+
+
+def _values(axis: Override, item: str) -> list[str]:
+    """What a sweep over one key stands for. A range is counted before it is written out: it may have no end."""
+    from hydra.core.override_parser.types import RangeSweep
+
+    span: Any = axis.value()
+    if isinstance(span, RangeSweep) and span.start is not None and span.stop is not None:
+        if span.step == 0:
+            raise UserError("is a range whose step is 0", where=item)
+        if abs((span.stop - span.start) / span.step) > MOST_VALUES:
+            raise UserError(f"stands for more than {MOST_VALUES} values", where=shorten(item))
+    return list(axis.sweep_string_iterator())
 
 
 def run_hydra(arguments: Sequence[str], project: Path) -> None:

@@ -20,7 +20,7 @@ import yaml
 from PIL import Image
 
 from sceneexpander import expand as command
-from sceneexpander.errors import UserError
+from sceneexpander.errors import UserError, printable
 from sceneexpander.expand import Request, expand, run_name, stage_scene
 from sceneexpander.workspace import run_lock
 
@@ -254,6 +254,28 @@ def test_a_picture_of_any_name_is_inserted(name: str, tmp_path: Path) -> None:
     facts = yaml.safe_load((tmp_path / "copy" / "scene.yaml").read_text())["rounds"][0]
     assert facts["prompt"] == "A ${seed} 'bench' #5."
     assert (tmp_path / "copy" / facts["inserted"]).read_bytes() == given.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["c.jpg", "c\nd\x1b[2J.jpg"])
+def test_the_last_lines_say_what_became_of_the_photos(
+    name: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ran(folder: Path, **_: object) -> None:
+        cameras = {"summary": f"2 of 3 photos used: {name} left out (its matches agree with no camera)"}
+        page = folder / "outputs" / "pages" / "photos" / "page.json"
+        page.parent.mkdir(parents=True)
+        page.write_text(json.dumps({"cameras": cameras, "rounds": [{"number": 1, "cameras": None}]}))
+
+    monkeypatch.setattr(command, "reproduce", ran)
+    monkeypatch.setattr(command, "find_project", lambda: project)
+    inserted = picture(tmp_path / "new.png", 150)
+    arguments = [str(photos(tmp_path / "photos")), "--inserted", str(inserted), "--prompt", "A bench."]
+    monkeypatch.setattr(sys, "argv", ["expand", *arguments])
+    command.main()
+    assert capsys.readouterr().out.splitlines() == [
+        f"photos: 2 of 3 photos used: {printable(name)} left out (its matches agree with no camera)",
+        f"report: {project / 'runs' / 'photos' / 'outputs' / 'report' / 'index.html'}",
+    ]
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder", "nothing", "long"])

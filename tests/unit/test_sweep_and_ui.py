@@ -28,6 +28,11 @@ ROOT = Path(__file__).parents[2]
         (["foo"], "foo: is not a setting"),
         (["--mutirun", "seed=1"], "did you mean '--multirun'?"),
         (["--multirun", "seed=range(1"], "seed=range(1"),
+        *(([f"seed={text}"], "seed") for text in ("9" * 5000, "1," + "9" * 5000)),
+        (["--multirun", f"seed={'[' * 400}{']' * 400}"], "nested too deeply"),
+        (["--multirun", "seed=range(1,1e99)"], "more than 1000 values"),
+        (["--multirun", "seed=shuffle(range(1,1000000000))"], "more than 1000 values"),
+        (["--multirun", "seed=range(0,3,0)"], "step is 0"),
         (["--multirun", "adapt.steps=interval(1,2)"], "is a range without steps"),
         (["hydra.nope=1"], "hydra.nope"),
         (["hydra/launcher=nope"], "hydra/launcher"),
@@ -40,6 +45,7 @@ def test_what_there_is_not_is_one_line(given: list[str], line: str) -> None:
         check_axes(given, ROOT)
     assert line in caught.value.line()
     assert "\n" not in caught.value.line()
+    assert len(caught.value.line()) < 500
 
 
 def test_good_axes_pass_as_they_are() -> None:

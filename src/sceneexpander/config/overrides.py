@@ -20,6 +20,7 @@ from sceneexpander.config.parse import ConfigError
 from sceneexpander.config.schema import ProjectConfig
 
 PATH_KEYS = frozenset({"model.weights", "generator.file", "rivals.omnivggt.weights", "rivals.ttt3r.weights"})
+MAX_OVERRIDE = 20_000  # characters: key frames are the longest
 ROUND_FIELD = "{round}"  # in ``generator.file``: the number of the round
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_./@-]*")  # the same in every grammar, and easier to read without quotes
 _WORDS = frozenset({"null", "true", "false", "inf", "nan"})
@@ -86,13 +87,16 @@ def _written_out(item: str, *, absolute: bool, sweep: bool) -> str:
         raise ConfigError("holds a byte that is not valid text", where=name)
     if not equals or name not in text_keys():
         return item
+    if len(item) > MAX_OVERRIDE:
+        return item  # is refused when it is composed
     if name in PATH_KEYS and _names_a_file(raw, where=name):
         return f"{key}={quoted(_absolute(raw, name) if absolute else raw)}"
     try:
         parsed = OverridesParser.create().parse_override(item)
-    except HydraException:
+        value = parsed.value()
+    # Beside its own errors, the parser lets those of very long numbers and deep lists through.
+    except (HydraException, ValueError, TypeError, LookupError, RecursionError):
         return f"{key}={quoted(raw)}"
-    value = parsed.value()
     if parsed.value_type != ValueType.ELEMENT or isinstance(value, (list, dict)):
         return item if sweep else f"{key}={quoted(raw)}"
     # Written as Hydra wants it, e.g. in quotes.

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneexpander.config.compose import compose
+from sceneexpander.config.compose import check_override, compose
 from sceneexpander.config.overrides import override, text_keys, written_out
 from sceneexpander.config.parse import ConfigError
 
@@ -56,6 +56,7 @@ def test_any_text_comes_back_as_it_was(plain: Any, text: str) -> None:
     item = override("tracking.experiment", text)
     parsed = OverridesParser.create().parse_override(item)
     assert not parsed.is_sweep_override()
+    assert check_override(CONF, item)
     assert plain(item) == text
     # Going through again changes nothing: a sweep hands its jobs what it has written out already.
     assert written_out([item], absolute=True) == (item,)
@@ -100,6 +101,20 @@ def test_a_picture_in_any_folder_is_found(name: str, tmp_path: Path, monkeypatch
 def test_texts_that_are_no_files_are_taken_literally_too(text: str) -> None:
     (item,) = written_out([f"tracking.experiment={text}"])
     assert compose(CONF, [item])["tracking"]["experiment"] == text
+
+
+@pytest.mark.parametrize("text", ["9" * 5000, "[" * 5000 + "]" * 5000, "{" * 900, "f(" * 3000])
+def test_what_hydras_parser_gives_up_on_is_a_text(text: str) -> None:
+    (item,) = written_out([f"tracking.experiment={text}"])
+    assert item == override("tracking.experiment", text)
+    assert check_override(CONF, item)
+
+
+@pytest.mark.parametrize("key", ["tracking.experiment", "model.weights", "seed"])
+def test_a_value_longer_than_any_is_refused_by_its_length(key: str) -> None:
+    (item,) = written_out([f"{key}={'b c,' * 50_000}"], absolute=True)
+    with pytest.raises(ConfigError, match=r"has 2000\d\d characters"):
+        check_override(CONF, item)
 
 
 @pytest.mark.parametrize(
