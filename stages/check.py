@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sceneexpander.config.overrides import written_out
 from sceneexpander.errors import entry_point
 from sceneexpander.preflight import check_scene
-from sceneexpander.workspace import read_selection
+from sceneexpander.selection import read_selection
 from stages import layout
-from stages.resolve import CONF, read_methods
+from stages.resolve import CONF
 
 
 @entry_point
 def main() -> None:
     """Raise the first problem as one line."""
     selection = read_selection(Path())
-    methods = read_methods(Path("params.yaml"))
     for scene in selection.scenes:
         check_scene(
             scene,
             layout.source(scene),
             conf=CONF,
-            overrides=selection.overrides,
+            overrides=written_out(selection.overrides),
             rounds=selection.rounds,
-            methods=methods,
+            methods=selection.methods,
         )
 
 

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sceneexpander.selection import METHODS, OPTIMISABLE, OURS, RIVALS, SPLATTED
+
+__all__ = ["METHODS", "OPTIMISABLE", "OURS", "RIVALS", "SPLATTED"]
+
 SCENES = Path("scenes")
 OUTPUTS = Path("outputs")
 PAGES = OUTPUTS / "pages"  # what is shown of every scene, gathered from its artefacts
 REPORT = OUTPUTS / "report"
 CODE = OUTPUTS / "code.json"
-OURS = ("captured", "backbone", "sceneexpander")  # always made: the pipeline itself needs them
-RIVALS = ("omnivggt", "ttt3r")  # networks of others
-SPLATTED = "gaussian_splatting"  # per-scene optimisation, started from the backbone
-OPTIMISABLE = ("sceneexpander", *RIVALS)  # what an optimisation after the fact can start from
 REPEATS = "repeat_*"
 REFINEMENT = "refinement.json"  # beside a reconstruction whose Gaussians were refined: what it changed
-METHODS = (*OURS, SPLATTED, *RIVALS, *(f"{method}_optimised" for method in OPTIMISABLE))
 
 
 def source(scene: str) -> Path:

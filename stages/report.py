@@ -8,6 +8,7 @@ from typing import Any
 from sceneexpander.artifacts.metrics import MetricsRow, Row, load_row
 from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
 from sceneexpander.config.files import read_yaml
+from sceneexpander.errors import UserError
 from sceneexpander.evaluation.table import comparison_table, scene_table
 from sceneexpander.report import write_page
 from stages import layout
@@ -38,6 +39,8 @@ def main(_: Cell) -> None:
                     else {"unavailable": row.reason}
                 )
                 numbers.setdefault(scene, {}).setdefault(f"round_{item['k']}", {})[method] = known
+    if not rows:
+        raise UserError("selects nothing to report", where="params.yaml", fix="name scenes, rounds and methods")
     with directory_being_written(layout.REPORT) as folder:
         write_page([layout.PAGES / scene for scene in selected["scenes"]], folder)
         write_bytes_atomic(folder / "comparison.md", comparison_table(rows).markdown().encode())

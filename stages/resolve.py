@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from sceneexpander.config.compose import compose, scene_option
-from sceneexpander.config.files import read_yaml, write_yaml
-from sceneexpander.config.parse import ConfigError
-from sceneexpander.errors import did_you_mean
+from sceneexpander.config.files import write_yaml
+from sceneexpander.config.overrides import written_out
+from sceneexpander.selection import read_selection
 from stages import layout
 from stages.runner import Cell, stage
 
@@ -15,28 +15,13 @@ CONF = Path("conf")
 
 
 def read_overrides(path: Path) -> list[str]:
-    """The ``overrides`` of params.yaml."""
-    raw = read_yaml(path)
-    overrides = raw.get("overrides") if isinstance(raw, dict) else None
-    if not isinstance(overrides, list) or not all(isinstance(item, str) for item in overrides):
-        raise ConfigError("must be a list of texts such as adapt.steps=5", where=f"{path}: overrides")
-    return overrides
+    """The ``overrides`` of params.yaml, as Hydra reads them."""
+    return list(written_out(read_selection(path.parent).overrides))
 
 
 def read_methods(path: Path) -> list[str]:
     """The ``methods`` of params.yaml, all of them known, and none without what it starts from."""
-    raw = read_yaml(path)
-    methods = raw.get("methods") if isinstance(raw, dict) else None
-    where = f"{path}: methods"
-    if not isinstance(methods, list) or not methods:
-        raise ConfigError("must be a list of methods", where=where, fix=f"use {', '.join(layout.METHODS)}")
-    for method in methods:
-        if method not in layout.METHODS:
-            raise ConfigError(f"unknown {method!r}", where=where, fix=did_you_mean(str(method), layout.METHODS))
-    for start in layout.RIVALS:
-        if f"{start}_optimised" in methods and start not in methods:
-            raise ConfigError(f"'{start}_optimised' starts from {start!r}", where=where, fix=f"list {start} too")
-    return [str(method) for method in methods]
+    return list(read_selection(path.parent).methods)
 
 
 @stage("scene")

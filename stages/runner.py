@@ -16,14 +16,17 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_yaml
-from sceneexpander.errors import EXIT_BAD_INPUT, UserError
+from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, disk_full, interruptible
+from sceneexpander.processes import end_with_parent
 from sceneexpander.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
 from stages import layout
+
+STAGE_ENV = "DVC_STAGE"  # set by DVC for the commands that it runs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,20 +77,35 @@ def stage(*axes: str) -> Callable[[Callable[[Cell], None]], Callable[[], None]]:
 
         @functools.wraps(body)
         def main() -> None:
+            interruptible()
+            if STAGE_ENV in os.environ:
+                end_with_parent()  # an orphan would write into folders that the next run writes to as well
             cell = _parse(name, axes)
             logging.basicConfig(level=logging.INFO, format=f"%(levelname)s {name}: %(message)s")
             try:
                 with _measured(_statistics_path(name, axes, cell)):
                     body(cell)
             except UserError as error:
-                print(f"error: {error.line()}", file=sys.stderr, flush=True)
-                if ERROR_FILE_ENV in os.environ:
-                    write_bytes_atomic(Path(os.environ[ERROR_FILE_ENV]), f"{error.line()}\n".encode())
-                raise SystemExit(EXIT_BAD_INPUT) from None
+                _refuse(error)
+            except KeyboardInterrupt:
+                raise SystemExit(EXIT_INTERRUPTED) from None  # who started the pipeline says so
+            except Exception as error:
+                full = disk_full(error)
+                if full is None:
+                    raise
+                _refuse(full)
 
         return main
 
     return decorate
+
+
+def _refuse(error: UserError) -> NoReturn:
+    print(f"error: {error.line()}", file=sys.stderr, flush=True)
+    if ERROR_FILE_ENV in os.environ:
+        with contextlib.suppress(OSError):  # the disk may be full: that is what there is to say then
+            write_bytes_atomic(Path(os.environ[ERROR_FILE_ENV]), f"{error.line()}\n".encode())
+    raise SystemExit(EXIT_BAD_INPUT) from None
 
 
 def _parse(name: str, axes: tuple[str, ...]) -> Cell:
@@ -154,5 +172,6 @@ def use_threads(count: int) -> None:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete a folder that may not exist."""
-    shutil.rmtree(path, ignore_errors=True)
+    """Delete a folder that may not exist. Raises `OSError` if it is there and stays."""
+    if path.exists():
+        shutil.rmtree(path)

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sceneexpander.artifacts.store import write_json_atomic
-from sceneexpander.config.files import read_sections, read_yaml
+from sceneexpander.config.files import read_sections
+from sceneexpander.errors import UserError, disk_full
 from sceneexpander.project import SWEEP_ENV
-from sceneexpander.tracking import TrackingConfig, record_runs, scene_runs
+from sceneexpander.selection import read_selection
+from sceneexpander.tracking import RunRecord, TrackingConfig, record_runs, scene_runs
 from stages import layout
 from stages.runner import Cell, project_root, stage
 
+_log = logging.getLogger(__name__)
 MARKER = Path("mlflow/tracked.json")
 
 
@@ -28,7 +32,10 @@ class Sections:
 
 def commit_of(folder: Path) -> str:
     """The commit of the sources, or ``unknown`` outside of version control."""
-    done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=folder, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=folder, capture_output=True, text=True, check=False)
+    except OSError:  # no git
+        return "unknown"
     return done.stdout.strip() if done.returncode == 0 else "unknown"
 
 
@@ -38,20 +45,33 @@ def _large_files(scene: str, number: int, method: str) -> list[Path]:
 
 @stage()
 def main(_: Cell) -> None:
-    """Record what is missing; the marker holds the runs' identities, which are the same on every machine."""
-    selected: dict[str, Any] = read_yaml(Path("params.yaml"))
-    keys: dict[str, list[str]] = {}
+    """Record what is missing; the marker holds the runs' identities, which are the same on every machine.
+
+    Recording is a copy of what the files say: where it fails, the run itself is as good as ever, and one line says so.
+    """
+    keys: dict[str, list[str] | None] = {}
     root = project_root()
-    for scene in selected["scenes"]:
+    for scene in read_selection(Path()).scenes:
         sections = read_sections(layout.config(scene), Sections)
         records = scene_runs(
             layout.PAGES / scene,
             commit=commit_of(root),
             extra=functools.partial(_large_files, scene),
         )
-        record_runs(records, sections.tracking, root, sweep=os.environ.get(SWEEP_ENV))
-        keys[scene] = [record.key for record in records]
+        recorded = _recorded(records, sections.tracking, root)
+        keys[scene] = [record.key for record in records] if recorded else None  # None: see `sceneexpander.pipeline`
     write_json_atomic(MARKER, keys)
+
+
+def _recorded(records: Sequence[RunRecord], config: TrackingConfig, root: Path) -> bool:
+    try:
+        record_runs(records, config, root, sweep=os.environ.get(SWEEP_ENV))
+    except Exception as error:  # noqa: BLE001 - MLflow raises whatever its database, its server and its disk raise
+        known = disk_full(error) or error
+        line = known.line() if isinstance(known, UserError) else str(known).strip().partition("\n")[0]
+        _log.warning("not recorded in MLflow (%s); the same command tries again", line or type(error).__name__)
+        return False
+    return True
 
 
 if __name__ == "__main__":

@@ -73,7 +73,10 @@ def make_plan(
     seeds: Sequence[str],
     more: Sequence[str],
 ) -> tuple[Plan, ProjectConfig]:
-    """The plan, and the configuration that all its rows share. Raises `UserError` for anything unknown."""
+    """The plan, and the configuration that all its rows share. Raises `UserError` for anything unknown, and for a plan of nothing."""
+    for option, values in (("rows", rows), ("scenes", scenes), ("grades", grades), ("seeds", seeds)):
+        if not values:
+            raise UserError("is empty", where=f"--{option}", fix="name one or more, or leave the option out")
     for scene in scenes:
         if scene not in SCENES:
             raise UserError(f"unknown scene {scene!r}", where="--scenes", fix=did_you_mean(scene, SCENES))
@@ -132,6 +135,12 @@ def main() -> None:
         )
 
     cells = run(plan, settings, processes=options.processes, on_cell=on_cell)
+    if not cells:
+        raise UserError(
+            "holds no finished cell of this plan, and a table without any would take the place of one that is there",
+            where=settings.cache,
+            fix="leave out --finished, or add --any-code",
+        )
     out: Path = options.out or project / "results" / "ablation"
     text = report(cells, plan, model=shared.model.name)
     content = {

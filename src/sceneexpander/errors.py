@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import functools
+import os
+import signal
 import sys
 import unicodedata
 from collections.abc import Callable, Iterable
@@ -13,6 +16,13 @@ from typing import TypeVar
 Result = TypeVar("Result")
 
 EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+_FULL_TEXTS = (
+    "no space left on device",
+    "disk quota exceeded",
+    "database or disk is full",
+)  # of libraries with errors of their own
 _TURNING = frozenset("\u200e\u200f\u061c\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
@@ -66,15 +76,68 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(choices)}"
 
 
+def disk_full(error: BaseException) -> UserError | None:
+    """What to say if ``error``, or an error that it came from, means that a disk is full; None for everything else."""
+    chain: list[BaseException] = []
+    current: BaseException | None = error
+    while current is not None and current not in chain:
+        chain.append(current)
+        current = current.__cause__ or current.__context__
+    for one in chain:
+        number = one.errno if isinstance(one, OSError) else None
+        if number in _FULL or any(text in str(one).casefold() for text in _FULL_TEXTS):
+            # The second name, where there are two, is what was written to.
+            name = (one.filename2 or one.filename) if isinstance(one, OSError) else None
+            where = Path(os.fsdecode(name)).parent if isinstance(name, (str, bytes)) else Path.cwd()
+            what = "the quota of this disk is used up" if number == errno.EDQUOT else "No space left on device"
+            fix = "make room and start the same command again, it goes on with what is missing"
+            return UserError(what, where=where, fix=fix)
+    return None
+
+
+def quiet_start() -> None:
+    """Until `interruptible` an interrupt is one line and the end: imports take seconds, and nothing has been begun."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # neither ignored nor somebody else's
+        signal.signal(signal.SIGINT, _leave)
+
+
+def interruptible() -> None:
+    """From here on an interrupt is a `KeyboardInterrupt` again."""
+    if signal.getsignal(signal.SIGINT) is _leave:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _leave(*_: object) -> None:
+    os.write(2, b"interrupted\n")
+    os._exit(EXIT_INTERRUPTED)
+
+
 def entry_point(main: Callable[..., Result]) -> Callable[..., Result]:
-    """Wrap a ``main`` so that a `UserError` ends as one line on stderr and exit code 2."""
+    """Wrap a ``main`` so that what the user can mend ends as one line on stderr: a `UserError` or a full disk, with exit code 2.
+
+    An interrupt (Ctrl-C) is one line too, with the exit code that shells give it.
+    """
 
     @functools.wraps(main)
     def wrapped(*args: object, **kwargs: object) -> Result:
+        interruptible()
+        # A terminal that cannot show a letter gets its number: a message must not fail for the name that it is about.
+        for stream in (sys.stdout, sys.stderr):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="backslashreplace")
         try:
             return main(*args, **kwargs)
         except UserError as error:
             print(f"error: {error.line()}", file=sys.stderr)
+            raise SystemExit(EXIT_BAD_INPUT) from None
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            raise SystemExit(EXIT_INTERRUPTED) from None
+        except Exception as error:
+            full = disk_full(error)
+            if full is None:
+                raise
+            print(f"error: {full.line()}", file=sys.stderr)
             raise SystemExit(EXIT_BAD_INPUT) from None
 
     return wrapped

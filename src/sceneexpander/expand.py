@@ -7,24 +7,33 @@ The methods are those that the project selects.
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 
-from sceneexpander.errors import UserError, entry_point
-from sceneexpander.ingest import make_round, read_picture, safe_name, survey_pictures
-from sceneexpander.plainfiles import require_folder
+from sceneexpander.artifacts.store import write_bytes_atomic
+from sceneexpander.errors import UserError, entry_point, printable
+from sceneexpander.ingest import make_round, read_picture, safe_name, scene_files, survey_pictures
+from sceneexpander.plainfiles import require_folder, require_plain_file
 from sceneexpander.preflight import check_scene
+from sceneexpander.processes import ended_by_signals
 from sceneexpander.project import find_project
-from sceneexpander.workspace import Selection, make_workspace, merged_overrides, read_selection, reproduce
+from sceneexpander.report.cameras import camera_lines
+from sceneexpander.selection import Selection, check_name, read_selection
+from sceneexpander.workspace import make_workspace, merged_overrides, remove_tree, reproduce, run_lock
 
 SCENE_FILE = "scene.yaml"
+SOURCE_FILE = "source.json"  # in a run's folder: which photos it is of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,6 +77,8 @@ def parse_arguments(arguments: Sequence[str]) -> Request:
 def stage_scene(request: Request, name: str, target: Path) -> None:
     """Put the scene together as a folder with ``scene.yaml``: a copy of a scene folder, or made from photos and options.
 
+    A copy holds what ``scene.yaml`` names and nothing else, as plain files that can be written.
+
     Raises:
         UserError: the folder, a picture or an option is unusable.
     """
@@ -79,7 +90,8 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
             raise UserError(
                 "says itself what to add", where=photos / SCENE_FILE, fix="leave out --prompt, --inserted and the like"
             )
-        shutil.copytree(photos, target, symlinks=False)
+        for path in scene_files(photos):
+            _copy(path, target / path.relative_to(photos))
         return
     count = max(len(item) for item in words)
     specs = [
@@ -91,11 +103,9 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
         )
         for k in range(max(count, 1))
     ]
-    captured = target / "captured"
-    captured.mkdir(parents=True)
     survey = survey_pictures(photos)
     for path in survey.pictures:
-        shutil.copyfile(path, captured / path.name)
+        _copy(path, target / "captured" / path.name)
     rounds = []
     for k, spec in enumerate(specs):
         if k >= len(request.inserted):
@@ -103,12 +113,10 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
                 f"round {k + 1} has no picture", where="--inserted", fix="give one --inserted PICTURE for each round"
             )
         source = request.inserted[k]
+        require_plain_file(source)
         read_picture(source, max_megapixels=200.0)
-        # The content decides what it is: an ending is for people, and may be as odd or long as the whole name.
-        ending = source.suffix.lower() if re.fullmatch(r"\.[A-Za-z0-9]{1,8}", source.suffix) else ""
-        copy = Path("inserted") / f"round_{k + 1}{ending}"
-        (target / copy).parent.mkdir(exist_ok=True)
-        shutil.copyfile(source, target / copy)
+        copy = _inserted_name(k + 1, source)
+        _copy(source, target / copy)
         words_of_round = {"prompt": spec.prompt, "motion": spec.motion, "object": spec.new_object}
         rounds.append({**{key: text for key, text in words_of_round.items() if text}, "inserted": copy.as_posix()})
     # The copy holds nothing but photos: what else was there is told by the notes alone.
@@ -117,30 +125,122 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
     (target / SCENE_FILE).write_text(text, encoding="utf-8")
 
 
+def _inserted_name(number: int, source: Path) -> Path:
+    """Where the picture of a round lies in a scene folder.
+
+    The content decides what it is: an ending is for people, and may be as odd or long as the whole name.
+    """
+    ending = source.suffix.lower() if re.fullmatch(r"\.[A-Za-z0-9]{1,8}", source.suffix) else ""
+    return Path("inserted") / f"round_{number}{ending}"
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy the content of a file, through a link too."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+
+
+def _is_text(text: str) -> bool:
+    return not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
 def _at(items: Sequence[str], index: int) -> str:
     return items[index] if index < len(items) else ""
+
+
+def run_name(request: Request) -> str:
+    """The name of the run and of its scene: the one that was asked for, or the folder's, in plain letters.
+
+    Raises:
+        UserError: the pipeline itself uses this name.
+    """
+    given = request.name if request.name is not None else request.photos.resolve().name
+    name = safe_name(given, fallback="scene")
+    check_name(name, where="--name" if request.name is not None else request.photos, fix="choose another --name")
+    return name
+
+
+def check_source(folder: Path, request: Request) -> None:
+    """Raise `UserError` if the run in ``folder`` is of other photos: two folders may have one name, or names reduced to one."""
+    try:
+        known: dict[str, Any] = json.loads((folder / SOURCE_FILE).read_text(encoding="utf-8"))
+        photos = Path(known["photos"])
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UserError("is damaged", where=folder / SOURCE_FILE, fix="choose another --name") from None
+    if photos != _identity(request):
+        raise UserError(f"holds another folder's scene ({photos})", where=folder, fix="choose another --name")
+
+
+def _identity(request: Request) -> Path:
+    return request.photos.resolve()
+
+
+def _check_words(request: Request) -> None:
+    named = {"--prompt": request.prompts, "--motion": request.motions, "--object": request.objects}
+    named |= {"--name": (request.name or "",)}
+    for option, texts in named.items():
+        if not all(map(_is_text, texts)):
+            raise UserError("holds a byte that is not valid text", where=option, fix="write it in UTF-8")
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """A folder on the run's disk, so that what is put together there need not be copied again. Earlier ones of killed runs go."""
+    for left in folder.parent.glob(f".{folder.name}.*.part"):
+        remove_tree(left)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
+    try:
+        yield scratch
+    finally:
+        remove_tree(scratch)
 
 
 def expand(request: Request, *, project: Path) -> Path:
     """Check the request, run the pipeline in ``runs/NAME`` and return the report page.
 
     Raises:
-        UserError: the input is unusable (nothing has run then), or a stage refused it.
+        UserError: the input is unusable (nothing has run then), somebody else works on this run, or a stage refused the input.
         RuntimeError: a stage failed for another reason.
     """
+    _check_words(request)
     require_folder(request.photos, expected="a folder of photos")
-    name = safe_name(request.name or request.photos.resolve().name, fallback="scene")
+    name = run_name(request)
     folder = project / "runs" / name
-    with tempfile.TemporaryDirectory(prefix="sceneexpander-") as scratch:
-        scene = Path(scratch) / name
-        stage_scene(request, name, scene)
-        overrides = merged_overrides((), request.overrides)
-        methods = read_selection(project).methods
-        rounds = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=methods)
-        selection = Selection(scenes=(name,), rounds=rounds, methods=methods, overrides=overrides)
-        make_workspace(folder, selection, project=project, scenes={name: scene})
-    reproduce(folder, project=project)
+    overrides = merged_overrides((), request.overrides)
+    methods = read_selection(project).methods
+    # The lock comes first: nothing may change in a folder that another process works on.
+    with run_lock(folder) as lock:
+        check_source(folder, request)
+        with _scratch(folder) as scratch:
+            scene = scratch / name
+            with _shown_as_given(scene, request):
+                stage_scene(request, name, scene)
+                rounds = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=methods)
+            selection = Selection(scenes=(name,), rounds=rounds, methods=methods, overrides=overrides)
+            folder.mkdir(exist_ok=True)
+            source = json.dumps({"photos": os.fsdecode(_identity(request)), "name": name}, indent=1)
+            write_bytes_atomic(folder / SOURCE_FILE, f"{source}\n".encode())
+            make_workspace(folder, selection, project=project, scenes={name: scene}, move_scenes=True)
+        reproduce(folder, project=project, lock=lock)
     return folder / "outputs" / "report" / "index.html"
+
+
+@contextmanager
+def _shown_as_given(scene: Path, request: Request) -> Iterator[None]:
+    """Errors about the copy of a scene name the file that it was copied from."""
+    try:
+        yield
+    except UserError as error:
+        originals: dict[Path, Path] = {}
+        if not (request.photos / SCENE_FILE).is_file():
+            originals |= {scene / _inserted_name(k, path): path for k, path in enumerate(request.inserted, start=1)}
+            originals[scene / "captured"] = request.photos
+        where, problem = error.where or "", error.problem
+        for copy, original in {**originals, scene: request.photos}.items():
+            where, problem = where.replace(str(copy), str(original)), problem.replace(str(copy), str(original))
+        raise UserError(problem, where=where or None, fix=error.fix) from None
 
 
 @entry_point
@@ -148,10 +248,13 @@ def main() -> None:
     """Command line."""
     request = parse_arguments(sys.argv[1:])
     try:
-        page = expand(request, project=find_project())
+        with ended_by_signals():
+            page = expand(request, project=find_project())
     except RuntimeError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
+    for line in camera_lines(page.parents[1]):
+        print(printable(line))
     print(f"report: {page}")
 
 

@@ -24,9 +24,16 @@ def find_project() -> Path:
     """
     named = os.environ.get(ROOT_ENV)
     if named:
-        return Path(named).resolve()
+        root = Path(named).resolve()
+        if not _holds_pipeline(root):
+            raise UserError("holds no pipeline (dvc.yaml and conf/)", where=f"{ROOT_ENV}={named}", fix="unset it")
+        return root
     here = Path.cwd().resolve()
     for folder in (here, *here.parents, Path(__file__).resolve().parents[2]):
-        if (folder / "dvc.yaml").is_file() and (folder / "conf" / "config.yaml").is_file():
+        if _holds_pipeline(folder):
             return folder
     raise UserError("holds no pipeline (dvc.yaml and conf/)", where=here, fix="run this in the project folder")
+
+
+def _holds_pipeline(folder: Path) -> bool:
+    return (folder / "dvc.yaml").is_file() and (folder / "conf" / "config.yaml").is_file()

@@ -4,41 +4,69 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
+import socket
 import sys
 
 from sceneexpander.errors import UserError, entry_point
+from sceneexpander.processes import ended_by_signals, kept
 from sceneexpander.project import LIVE_FOLDER, find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.describe import experiment_links
 from sceneexpander.tracking.follow import Follower
-from sceneexpander.tracking.store import database_path, last_experiment, quiet_environment, tracking_uri
+from sceneexpander.tracking.store import (
+    database_path,
+    last_experiment,
+    quiet_environment,
+    set_damaged_aside,
+    tracking_uri,
+    without_foreign_settings,
+)
+
+HOST = "127.0.0.1"
 
 
 @entry_point
 def main() -> None:
-    """Start the server and print links that open the numbers, the charts and the pictures."""
+    """Start the server and print links that open the numbers, the charts and the pictures. What it starts ends with it, however it ends."""
     parser = argparse.ArgumentParser(prog="python -m sceneexpander.ui", description=__doc__)
     parser.add_argument("--port", type=int, default=5000)
     port = parser.parse_args().port
+    check_port(port)
     root = find_project()
+    quiet_environment()
+    set_damaged_aside(root)
     if not database_path(root).is_file():
         Follower(root / LIVE_FOLDER, root, TrackingConfig()).poll()  # the first run of all may still be under way
     if not database_path(root).is_file():
         raise UserError("does not exist yet", where=database_path(root), fix="run `make repro` first")
-    quiet_environment()
     # The landing page is about something else.
-    for name, link in experiment_links(f"http://127.0.0.1:{port}", last_experiment(root)).items():
+    for name, link in experiment_links(f"http://{HOST}:{port}", last_experiment(root)).items():
         print(f"{name + ':':9} {link}", flush=True)
-    command = [sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port)]
+    command = [sys.executable, "-m", "mlflow", "ui", "--host", HOST, "--port", str(port)]
     command += ["--backend-store-uri", tracking_uri(TrackingConfig(), root)]
-    follower = subprocess.Popen([sys.executable, "-m", "sceneexpander.follow"], cwd=root)
+    environment = without_foreign_settings(os.environ)
+    follow = [sys.executable, "-m", "sceneexpander.follow"]
     try:
-        raise SystemExit(subprocess.call(command, cwd=root, env=dict(os.environ)))
+        with (
+            ended_by_signals(),
+            kept(follow, cwd=root, env=environment),
+            kept(command, cwd=root, env=environment) as server,
+        ):
+            raise SystemExit(server.wait())
     except KeyboardInterrupt:
         raise SystemExit(0) from None
-    finally:
-        follower.terminate()
+
+
+def check_port(port: int) -> None:
+    """Raise `UserError` unless a server can listen on this port of this machine."""
+    if not 0 < port < 65536:
+        raise UserError(f"must be between 1 and 65535, is {port}", where="--port")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise UserError(f"{port} cannot be used ({error.strerror})", where="--port", fix="choose another") from None
 
 
 if __name__ == "__main__":

@@ -9,47 +9,33 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import glob
 import hashlib
+import json
 import os
 import shutil
-import signal
-import subprocess
+import stat
 import sys
+import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from sceneexpander.artifacts.store import write_bytes_atomic
-from sceneexpander.errors import UserError
-from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV, SWEEP_ENV, find_project
+from sceneexpander.config.overrides import key_of, written_out
+from sceneexpander.errors import UserError, interruptible, printable
+from sceneexpander.processes import ended_by_signals, kept
+from sceneexpander.project import SWEEP_ENV, find_project
+from sceneexpander.selection import PARAMS, Selection
+from sceneexpander.surroundings import LOCAL_CONFIG, local_config, pipeline_environment
+from sceneexpander.tracking.store import ignored_note
 
 COPIED_FOLDERS = ("conf", "src", "stages")
 COPIED_FILES = ("dvc.yaml", ".dvcignore", "pyproject.toml", ".dvc/config")
 ERROR_FILE = "error.txt"
-PATH_KEYS = frozenset({"model.weights", "generator.file", "rivals.omnivggt.weights", "rivals.ttt3r.weights"})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Selection:
-    """What a workspace runs: the content of its params.yaml."""
-
-    scenes: tuple[str, ...]
-    rounds: int
-    methods: tuple[str, ...] = ("captured", "backbone", "sceneexpander")
-    overrides: tuple[str, ...] = ()
-
-    def to_yaml(self) -> str:
-        """The text of params.yaml."""
-        content = {
-            "scenes": list(self.scenes),
-            "rounds": [{"k": k, "prev": k - 1} for k in range(1, self.rounds + 1)],
-            "methods": list(self.methods),
-            "overrides": list(self.overrides),
-        }
-        return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+_NOT_COPIED = shutil.ignore_patterns("__pycache__", "*.pyc", "*.egg-info", ".*.part")
+_LITTLE_BYTES = 1 << 20  # a disk with less than that is full
 
 
 def merged_overrides(base: Sequence[str], more: Sequence[str]) -> tuple[str, ...]:
@@ -57,36 +43,17 @@ def merged_overrides(base: Sequence[str], more: Sequence[str]) -> tuple[str, ...
 
     A workspace runs in a folder of its own, where a path relative to the user's would name nothing.
     """
-    by_key = {override.lstrip("+~").partition("=")[0]: override for override in (*base, *more)}
-    return tuple(_with_absolute_path(override) for override in by_key.values())
-
-
-def _with_absolute_path(override: str) -> str:
-    key, _, value = override.partition("=")
-    if key not in PATH_KEYS or not Path(value).expanduser().is_file():
-        return override
-    return f"{key}={Path(value).expanduser().resolve()}"
-
-
-def read_selection(project: Path) -> Selection:
-    """The selection of a project folder. Raises `UserError` if its params.yaml is malformed."""
-    path = project / "params.yaml"
-    try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return Selection(
-            scenes=tuple(str(scene) for scene in raw["scenes"]),
-            rounds=len(raw["rounds"]),
-            methods=tuple(str(method) for method in raw["methods"]),
-            overrides=tuple(str(item) for item in raw["overrides"]),
-        )
-    except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise UserError(
-            f"does not select a run ({error})", where=path, fix="see params.yaml of the repository"
-        ) from None
+    by_key = {key_of(override): override for override in (*base, *more)}
+    return written_out(tuple(by_key.values()), absolute=True)
 
 
 def make_workspace(
-    folder: Path, selection: Selection, *, project: Path, scenes: Mapping[str, Path] | None = None
+    folder: Path,
+    selection: Selection,
+    *,
+    project: Path,
+    scenes: Mapping[str, Path] | None = None,
+    move_scenes: bool = False,
 ) -> Path:
     """Create or refresh a workspace. Outputs of an earlier run in the same folder stay, so only what changed runs again.
 
@@ -95,6 +62,7 @@ def make_workspace(
         selection: what it runs.
         project: the folder that it copies the sources from and shares the cache with.
         scenes: scene folders by name; those not named here come from the project's ``scenes/``.
+        move_scenes: the folders in ``scenes`` are copies already, on the same disk, and become the workspace's.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in COPIED_FOLDERS:
@@ -105,73 +73,150 @@ def make_workspace(
     for scene in selection.scenes:
         source = (scenes or {}).get(scene, project / "scenes" / scene)
         if source.resolve() != (folder / "scenes" / scene).resolve():
-            _replace_folder(source, folder / "scenes" / scene)
-    write_bytes_atomic(folder / "params.yaml", selection.to_yaml().encode())
-    shared = project / ".dvc"
-    local = f"[core]\n    no_scm = true\n    site_cache_dir = {shared / 'tmp' / 'site'}\n[cache]\n    dir = {shared / 'cache'}\n"
-    write_bytes_atomic(folder / ".dvc" / "config.local", local.encode())
+            _replace_folder(source, folder / "scenes" / scene, move=move_scenes and scene in (scenes or {}))
+    write_bytes_atomic(folder / PARAMS, selection.to_yaml().encode())
+    write_bytes_atomic(folder / LOCAL_CONFIG, _shared_cache(folder, project))
     return folder
 
 
-def _replace_folder(source: Path, target: Path) -> None:
-    """Make ``target`` a copy of ``source``."""
+def _shared_cache(folder: Path, project: Path) -> bytes:
+    """DVC's local configuration of a workspace: no version control, the project's cache."""
+    shared = project.resolve() / ".dvc"
+    home = (folder / ".dvc").resolve()
+    # A relative path leaves out what the project's own folders are called, which DVC's configuration may not be able to say.
+    near = home.is_relative_to(project.resolve())
+    cache = os.path.relpath(shared / "cache", home) if near else shared / "cache"
+    try:
+        return local_config(cache=cache, site=shared / "tmp" / "site", no_scm=True)
+    except UserError:
+        return local_config(cache=cache, site=None, no_scm=True)  # pipelines get it by the environment as well
+
+
+def _replace_folder(source: Path, target: Path, *, move: bool = False) -> None:
+    """Make ``target`` a copy of ``source``, or ``source`` itself. What is copied can be written, whatever the original allows."""
     if not source.is_dir():
         raise UserError("does not exist", where=source)
     target.parent.mkdir(parents=True, exist_ok=True)
+    for left in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
+        remove_tree(left)  # of a run that was killed
     scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
     try:
-        shutil.copytree(source, scratch, ignore=shutil.ignore_patterns("__pycache__", "*.pyc", "*.egg-info", ".*.part"))
-        shutil.rmtree(target, ignore_errors=True)
+        if move:
+            source.rename(scratch)
+        else:
+            shutil.copytree(source, scratch, ignore=_NOT_COPIED)
+        _make_writable(scratch)
+        remove_tree(target)
         scratch.rename(target)
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        remove_tree(scratch)
+
+
+def _make_writable(folder: Path) -> None:
+    for path in (folder, *folder.rglob("*")):
+        if not path.is_symlink():
+            needed = stat.S_IRWXU if path.is_dir() else stat.S_IRUSR | stat.S_IWUSR
+            if path.stat().st_mode & needed != needed:
+                path.chmod(path.stat().st_mode | needed)
+
+
+def remove_tree(folder: Path) -> None:
+    """Delete a folder that may not exist, whatever its permissions say. Raises `OSError` if it cannot be deleted."""
+    if folder.is_symlink() or folder.is_file():
+        folder.unlink()
+    elif folder.exists():
+        _make_writable(folder)
+        shutil.rmtree(folder)
+
+
+@dataclass(frozen=True, slots=True)
+class RunLock:
+    """A folder that this process alone works on. ``descriptor`` keeps it so, in child processes too."""
+
+    descriptor: int
+
+    def note(self, *processes: int) -> None:
+        """Write down which processes are at work, for the message that others get."""
+        text = json.dumps({"processes": processes, "since": time.strftime("%Y-%m-%d %H:%M:%S")})
+        os.ftruncate(self.descriptor, 0)
+        os.pwrite(self.descriptor, text.encode(), 0)
+
+
+@contextlib.contextmanager
+def run_lock(folder: Path, *, what: Path | None = None) -> Iterator[RunLock]:
+    """Work on ``folder`` alone, until the block ends and the last child that the descriptor was handed to is gone.
+
+    The lock is a file beside the folder, so nothing that happens inside breaks it; the kernel releases it if the process dies.
+    ``what`` is what the error names instead of the folder.
+
+    Raises:
+        UserError: somebody else is at work there.
+    """
+    path = folder.with_name(f".{folder.name}.lock")
+    descriptor = _locked(path, folder if what is None else what, named=what is None)
+    try:
+        lock = RunLock(descriptor)
+        lock.note(os.getpid())
+        yield lock
+    finally:
+        if not folder.exists():  # nothing came of it: not even a lock stays
+            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                path.parent.rmdir()
+        os.close(descriptor)
+
+
+def _locked(path: Path, what: Path, *, named: bool) -> int:
+    """An open descriptor of the lock file, which is locked. ``named``: what it guards has a name that can be chosen."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
+                return descriptor
+        except BlockingIOError:
+            line = f"is being worked on by {_at_work(descriptor)}"
+            os.close(descriptor)
+            fix = "wait for it, end it, or choose another --name" if named else "wait for it or end it"
+            raise UserError(line, where=what, fix=fix) from None
+        os.close(descriptor)  # another process has taken the file away in between
+
+
+def _at_work(descriptor: int) -> str:
+    try:
+        noted = json.loads(os.pread(descriptor, 4096, 0))
+        processes = [int(process) for process in noted["processes"]]
+        alive = next((process for process in processes if _is_alive(process)), processes[0])
+        return f"process {alive} since {noted['since']}"
+    except (ValueError, KeyError, TypeError, IndexError):
+        return "another process"  # it has not written yet who it is
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def workspace_environment(folder: Path, project: Path) -> dict[str, str]:
     """Environment in which a workspace's stages run its own copy of the sources with this interpreter."""
-    return {
-        **os.environ,
-        ROOT_ENV: str(project),
-        ERROR_FILE_ENV: str(folder / ERROR_FILE),
-        "PYTHONPATH": str(folder / "src"),
-        # Not resolved: a virtual environment's python is a link, and its folder is what selects the environment.
-        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]),
-        "MLFLOW_DISABLE_TELEMETRY": "true",
-    }
+    environment = pipeline_environment(folder, project, error_file=folder / ERROR_FILE)
+    return environment | {"DVC_SITE_CACHE_DIR": str(project / ".dvc" / "tmp" / "site")}
 
 
-def run_group(command: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
-    """Run a command in a process group of its own; when this process is interrupted, the whole group ends with it."""
-    process = subprocess.Popen(list(command), cwd=cwd, env=dict(env), start_new_session=True)
-    previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM)) if _in_main_thread() else None
-    try:
-        return process.wait()
-    finally:
-        if process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGTERM)
-            process.wait()
-        if previous is not None:
-            signal.signal(signal.SIGTERM, previous)
-
-
-def _in_main_thread() -> bool:
-    import threading
-
-    return threading.current_thread() is threading.main_thread()
-
-
-def reproduce(folder: Path, *, project: Path) -> None:
-    """``dvc repro`` in a workspace.
+def reproduce(folder: Path, *, project: Path, lock: RunLock | None = None) -> None:
+    """``dvc repro`` in a workspace. It ends with this process, however that ends; until then it holds the ``lock``.
 
     Raises:
-        UserError: a stage refused its input; the message is the stage's own.
+        UserError: a stage refused its input (the message is the stage's own), or the disk is full.
         RuntimeError: anything else went wrong; the stage's output is on stderr.
     """
-    error = folder / ERROR_FILE
-    error.unlink(missing_ok=True)
-    code = run_group([sys.executable, "-m", "dvc", "repro"], cwd=folder, env=workspace_environment(folder, project))
-    _raise_for(code, folder)
+    _run(["-m", "sceneexpander.pipeline"], folder, workspace_environment(folder, project), lock)
 
 
 def reproduce_shared(folder: Path, *, project: Path, sweep: str | None = None) -> None:
@@ -179,12 +224,24 @@ def reproduce_shared(folder: Path, *, project: Path, sweep: str | None = None) -
 
     Runs are tagged with the id of the ``sweep``, if there is one.
     """
-    (folder / ERROR_FILE).unlink(missing_ok=True)
-    command = [sys.executable, "-m", "sceneexpander.workspace", str(folder)]
     environment = workspace_environment(folder, project)
     if sweep is not None:
         environment[SWEEP_ENV] = sweep
-    _raise_for(run_group(command, cwd=folder, env=environment), folder)
+    _run(["-m", "sceneexpander.workspace", str(folder)], folder, environment, None)
+
+
+def _run(arguments: Sequence[str], folder: Path, environment: Mapping[str, str], lock: RunLock | None) -> None:
+    (folder / ERROR_FILE).unlink(missing_ok=True)
+    note = ignored_note(os.environ)
+    if note is not None:
+        print(f"note: {printable(note)}", file=sys.stderr)
+    command = [sys.executable, *arguments]
+    held = () if lock is None else (lock.descriptor,)
+    with ended_by_signals(), kept(command, cwd=folder, env=environment, held=held) as process:
+        if lock is not None:
+            lock.note(os.getpid(), process.pid)
+        code = process.wait()
+    _raise_for(code, folder)
 
 
 def _raise_for(code: int, folder: Path) -> None:
@@ -193,7 +250,17 @@ def _raise_for(code: int, folder: Path) -> None:
     error = folder / ERROR_FILE
     if error.is_file():
         raise UserError(error.read_text(encoding="utf-8"))
+    require_room(folder)
     raise RuntimeError(f"the pipeline failed in {folder} (exit code {code}); its last lines say where")
+
+
+def require_room(folder: Path) -> None:
+    """Raise `UserError` if there is next to no room left on the disk of a pipeline folder or of its cache."""
+    project = find_project()
+    for place in (folder, project / ".dvc" / "cache"):
+        if place.exists() and shutil.disk_usage(place).free < _LITTLE_BYTES:
+            fix = "make room and start the same command again, it goes on with what is missing"
+            raise UserError("No space left on device", where=place, fix=fix)
 
 
 @contextlib.contextmanager
@@ -217,6 +284,10 @@ def run_stages(folder: Path, locks: Path) -> None:
     from dvc.repo import Repo
     from dvc.stage.cache import _can_hash, _get_stage_hash
 
+    from sceneexpander.pipeline import ask_for_recording, take_any_path
+
+    take_any_path()
+    ask_for_recording()
     addresses = [stage.addressing for stage in reversed(list(networkx.topological_sort(Repo(folder).index.graph)))]
     for address in addresses:
         stage = Repo(folder).stage.collect(address)[0]
@@ -230,6 +301,7 @@ def run_stages(folder: Path, locks: Path) -> None:
 
 def main() -> None:
     """``python -m sceneexpander.workspace FOLDER``: what `reproduce_shared` starts."""
+    interruptible()
     folder = Path(sys.argv[1]).resolve()
     os.chdir(folder)
     run_stages(folder, find_project() / ".cache" / "locks")

@@ -19,7 +19,8 @@ import pytest
 import yaml
 from PIL import Image
 
-from sceneexpander.workspace import Selection, make_workspace, workspace_environment
+from sceneexpander.selection import Selection
+from sceneexpander.workspace import make_workspace, workspace_environment
 
 pytestmark = pytest.mark.pipeline
 

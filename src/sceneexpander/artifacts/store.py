@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import glob
 import hashlib
 import json
 import logging
@@ -129,8 +130,12 @@ def to_plain(value: object) -> Any:
 
 @contextlib.contextmanager
 def directory_being_written(target: Path) -> Iterator[Path]:
-    """Yield a scratch directory that becomes ``target`` (replacing it) only if the block ends without an error."""
+    """Yield a scratch directory that becomes ``target`` (replacing it) only if the block ends without an error.
+
+    What a killed writer of the same target left is cleared first: a target has one writer at a time.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
+    _tidy(target)
     scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
     scratch.mkdir()
     try:
@@ -147,7 +152,8 @@ def directory_being_written(target: Path) -> Iterator[Path]:
             scratch.rename(target)
         _sync(target.parent)
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        if scratch.exists():
+            shutil.rmtree(scratch)
 
 
 def save_artifact(folder: Path, schema: str, facts: Mapping[str, object], tensors: Mapping[str, Tensor]) -> None:
@@ -326,11 +332,13 @@ def _byte_dtype() -> Any:
 
 
 def _tidy(folder: Path) -> None:
-    """Clear what a killed writer left: half a new resume point, or the old one already moved aside (which is whole)."""
-    for old in folder.parent.glob(f".{folder.name}.*.old"):
+    """Clear what a killed writer left: half a new folder, or the old one already moved aside (which is whole)."""
+    name = f".{glob.escape(folder.name)}.{'[0-9a-f]' * 8}"
+    for old in folder.parent.glob(f"{name}.old"):
         if folder.exists():
-            shutil.rmtree(old, ignore_errors=True)
+            shutil.rmtree(old)
         else:
             old.rename(folder)
-    for scratch in folder.parent.glob(f".{folder.name}.*.part"):
-        shutil.rmtree(scratch, ignore_errors=True)
+    for scratch in folder.parent.glob(f"{name}.part"):
+        if scratch.is_dir():
+            shutil.rmtree(scratch)

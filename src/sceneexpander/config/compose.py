@@ -10,6 +10,7 @@ from typing import Any
 from yaml import YAMLError
 
 from sceneexpander.artifacts.store import to_plain
+from sceneexpander.config.overrides import MAX_OVERRIDE, environment_hidden
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import did_you_mean
@@ -18,7 +19,6 @@ from sceneexpander.typed import shorten
 FORBIDDEN_KEYS = frozenset({"size", "nfiles"})  # the pipeline's cache key leaves these names out, silently
 DEFAULT_SCENE = "default"
 MAX_KEY = 200  # characters
-MAX_OVERRIDE = 20_000  # characters: key frames are the longest
 _ROOT = "config"
 
 
@@ -48,7 +48,7 @@ def compose(conf: Path, overrides: Sequence[str]) -> dict[str, Any]:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    with _initialised(conf):
+    with environment_hidden(), _initialised(conf):
         try:
             kept = [text for text in overrides if check_override(conf, text)]
             composed = hydra_compose(config_name=_ROOT, overrides=kept)

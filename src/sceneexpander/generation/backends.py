@@ -69,7 +69,8 @@ class FileGenerator:
         given = self.context.config.file
         if not given:
             raise UserError("is not set", where="generator.file", fix="give the path of your picture")
-        path = Path(os.path.expanduser(given.replace("{round}", str(self.context.round_number))))
+        named = given if os.path.isfile(given) else given.replace("{round}", str(self.context.round_number))
+        path = Path(os.path.expanduser(named))  # unlike Path's own, no error for a "~name" that is nobody's home
         if os.path.isdir(path):
             raise UserError(f"{path} is a folder", where="generator.file", fix="give the path of one picture")
         return [_stored(path, path.parent, "file", prompt, references)]

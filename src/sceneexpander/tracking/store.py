@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import itertools
 import logging
 import os
 import sqlite3
-from collections.abc import Collection, Iterator, Sequence
+import time
+import urllib.parse
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +32,47 @@ _METRICS_PER_CALL = 1000
 _PARAM_LENGTH = 6000
 
 
+# Of MLflow's variables those that say how to reach a server, not which one or what to record.
+_SERVER_SETTINGS = ("MLFLOW_TRACKING_", "MLFLOW_HTTP_REQUEST_", "MLFLOW_S3_", "MLFLOW_GCS_")
+_DECIDED = frozenset({"MLFLOW_TRACKING_URI"})  # by tracking.uri
+_OURS = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
+}
+_ATTEMPTS = 6  # to open a store that another process is making at the same moment
+_BUSY = ("already exists", "database is locked", "is locked", "no such table")
+
+
+def without_foreign_settings(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables of a shell without those that would send runs elsewhere or set MLflow up in another way.
+
+    Where runs go is said by ``tracking.uri`` alone. Names and passwords for a server stay.
+    """
+    kept = {
+        name: value
+        for name, value in environment.items()
+        if not name.startswith(("MLFLOW_", "_MLFLOW_")) or (name.startswith(_SERVER_SETTINGS) and name not in _DECIDED)
+    }
+    kept.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")  # an unreachable server is told of in seconds, not minutes
+    kept.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "30")
+    return kept | _OURS
+
+
+def ignored_note(environment: Mapping[str, str]) -> str | None:
+    """What to tell a user whose shell names a store for runs; None if it names none."""
+    named = environment.get("MLFLOW_TRACKING_URI")
+    return None if named is None else f"MLFLOW_TRACKING_URI={named} is ignored: tracking.uri says where runs go"
+
+
 def quiet_environment() -> None:
-    """No telemetry and no background job machinery; must run before MLflow is imported."""
-    os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
-    os.environ.setdefault("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
+    """No telemetry, no background job machinery, and no store from the user's shell; must run before MLflow is imported."""
+    note = ignored_note(os.environ)
+    if note is not None:
+        _log.warning("%s", note)
+    wanted = without_foreign_settings(os.environ)
+    for name in set(os.environ) - set(wanted):
+        del os.environ[name]
+    os.environ.update(wanted)
 
 
 def database_path(root: Path) -> Path:
@@ -41,8 +81,45 @@ def database_path(root: Path) -> Path:
 
 
 def tracking_uri(config: TrackingConfig, root: Path) -> str:
-    """MLflow's address of the store. Absolute: MLflow would otherwise take it relative to the current folder."""
-    return f"sqlite:///{database_path(root)}" if config.uri == "local" else config.uri
+    """MLflow's address of the store. Absolute: MLflow would otherwise take it relative to the current folder.
+
+    Raises:
+        UserError: the folder has a name that no address can hold.
+    """
+    if config.uri != "local":
+        return config.uri
+    from sqlalchemy.engine import make_url
+
+    path = str(database_path(root))
+    # The second form is without slashes: MLflow makes the folder of what it sees there, before anything is decoded.
+    for address in (f"sqlite:///{path}", f"sqlite:///{urllib.parse.quote(path, safe='')}"):
+        url = make_url(address)
+        if url.database == path and not url.query:
+            return address
+    raise UserError("cannot be written as an address", where=path, fix="rename the folder, or use tracking.uri=off")
+
+
+def set_damaged_aside(root: Path) -> Path | None:
+    """Rename a local database that cannot be read, so that a new one can be begun. Returns where it is now; None: it was fine."""
+    path = database_path(root)
+    if not path.is_file() or path.stat().st_size == 0:
+        return None
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as database:
+            problem = str(database.execute("PRAGMA quick_check(1)").fetchone()[0])
+    except sqlite3.OperationalError:
+        return None  # locked, or out of reach: not for us to judge
+    except sqlite3.DatabaseError as error:
+        problem = str(error)
+    if problem == "ok":
+        return None
+    number = next(n for n in itertools.count(1) if not path.with_name(f"{path.name}.damaged-{n}").exists())
+    aside = path.with_name(f"{path.name}.damaged-{number}")
+    path.rename(aside)
+    for ending in ("-wal", "-shm", "-journal"):
+        path.with_name(path.name + ending).unlink(missing_ok=True)
+    _log.warning("%s was damaged (%s): it is %s now, and a new one is begun", path, problem.splitlines()[0], aside.name)
+    return aside
 
 
 @contextlib.contextmanager
@@ -72,6 +149,8 @@ def record_runs(
     if config.uri == "off" or not records:
         return 0, 0
     with store_lock(root):
+        if config.uri == "local":
+            set_damaged_aside(root)
         known = _complete_local(root, config) if config.uri == "local" else {}
         missing = [record for record in records if record.key not in known]
         if not missing and sweep is None:
@@ -110,25 +189,50 @@ def _complete_local(root: Path, config: TrackingConfig) -> dict[str, str]:
 
 
 def open_store(config: TrackingConfig, root: Path) -> tuple[Any, str]:
-    """(client, id of the experiment), made if there is none."""
+    """(client, id of the experiment), made if there is none.
+
+    Raises:
+        UserError: the server cannot be reached or refuses, or the database cannot be used.
+    """
     quiet_environment()
     from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    with _making_lock(root) if config.uri == "local" else contextlib.nullcontext():
+        for attempt in range(_ATTEMPTS):
+            try:
+                return _open(config, root)
+            except (MlflowException, SQLAlchemyError, OSError, ValueError) as error:
+                # Others may be writing the first tables just now, e.g. an `mlflow ui` that nobody can ask to wait.
+                first = str(error).strip().partition("\n")[0] or type(error).__name__
+                if attempt == _ATTEMPTS - 1 or not any(text in str(error) for text in _BUSY):
+                    raise UserError(f"cannot be used ({first})", where=f"tracking.uri {config.uri}") from None
+                time.sleep(0.1 * 2**attempt)
+    raise AssertionError("the last attempt returns or raises")
+
+
+@contextlib.contextmanager
+def _making_lock(root: Path) -> Iterator[None]:
+    """One process at a time makes the tables; apart from `store_lock`, which its caller may hold."""
+    path = root / "mlflow" / ".making"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _open(config: TrackingConfig, root: Path) -> tuple[Any, str]:
     from mlflow.tracking import MlflowClient
 
     # After the import, which sets its own levels: making the tables is not worth twenty lines.
     for name in ("alembic", "mlflow"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    local = config.uri == "local"
-    try:
-        client = MlflowClient(tracking_uri=tracking_uri(config, root))
-        experiment = client.get_experiment_by_name(config.experiment)
-        if experiment is not None:
-            return client, experiment.experiment_id
-        location = (root / "mlflow" / "artifacts").as_uri() if local else None
-        return client, client.create_experiment(config.experiment, artifact_location=location)
-    except MlflowException as error:
-        first = str(error).splitlines()[0]
-        raise UserError(f"cannot be used ({first})", where=f"tracking.uri {config.uri}") from None
+    client = MlflowClient(tracking_uri=tracking_uri(config, root))
+    experiment = client.get_experiment_by_name(config.experiment)
+    if experiment is not None:
+        return client, experiment.experiment_id
+    location = (root / "mlflow" / "artifacts").as_uri() if config.uri == "local" else None
+    return client, client.create_experiment(config.experiment, artifact_location=location)
 
 
 def last_experiment(root: Path) -> str:

@@ -179,3 +179,38 @@ def test_the_tensor_hash_sees_names_shapes_and_values() -> None:
     }
     assert len(hashes) == 6
     assert sha256_of_tensors({"a": a, "b": a}) == sha256_of_tensors({"b": a, "a": a})
+
+
+def _killed_while_writing(target: Path, content: str) -> None:
+    """As a process leaves it that was ended in the middle of `directory_being_written`."""
+    scratch = target.with_name(f".{target.name}.0123abcd.part")
+    scratch.mkdir(parents=True)
+    (scratch / "half").write_text(content)
+
+
+@pytest.mark.parametrize("name", ["state", "a[b]", "x y"])
+def test_what_a_killed_writer_left_is_cleared_by_the_next(name: str, tmp_path: Path) -> None:
+    target = tmp_path / name
+    _killed_while_writing(target, "half")
+    _killed_while_writing(tmp_path / "other", "of another target")
+    (tmp_path / f".{name}.json.0123abcd.part").write_text("of a file that somebody is writing")
+    with directory_being_written(target) as folder:
+        (folder / "whole").write_text("x")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        [".other.0123abcd.part", f".{name}.json.0123abcd.part", name]
+    )
+
+
+def test_a_folder_moved_aside_by_a_killed_writer_is_not_lost(tmp_path: Path) -> None:
+    target = tmp_path / "state"
+    (tmp_path / ".state.0123abcd.old").mkdir()
+    (tmp_path / ".state.0123abcd.old" / "whole").write_text("x")
+    with pytest.raises(RuntimeError), directory_being_written(target):
+        raise RuntimeError
+    assert (target / "whole").read_text() == "x"
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]
+
+
+def test_half_written_folders_are_no_input_of_the_pipeline() -> None:
+    ignored = (Path(__file__).parents[3] / ".dvcignore").read_text().splitlines()
+    assert {".*.part", ".*.old"} <= set(ignored)

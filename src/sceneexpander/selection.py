@@ -1,0 +1,159 @@
+"""What is to run: the content of ``params.yaml``, checked before anything starts.
+
+Scenes and rounds become names of folders and words of commands, so only plain ones are taken.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sceneexpander.errors import UserError, did_you_mean
+from sceneexpander.yamlfile import read_user_yaml
+
+PARAMS = "params.yaml"
+OURS = ("captured", "backbone", "sceneexpander")  # always made: the pipeline itself needs them
+RIVALS = ("omnivggt", "ttt3r")  # networks of others
+SPLATTED = "gaussian_splatting"  # per-scene optimisation, started from the backbone
+OPTIMISABLE = ("sceneexpander", *RIVALS)  # what an optimisation after the fact can start from
+METHODS = (*OURS, SPLATTED, *RIVALS, *(f"{method}_optimised" for method in OPTIMISABLE))
+RESERVED = frozenset({"pages", "report", "code.json"})  # in outputs/, where every scene has a folder of its name
+MOST_ROUNDS = 100
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
+_KEYS = ("scenes", "rounds", "methods", "overrides")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Selection:
+    """What a pipeline runs.
+
+    Attributes:
+        scenes: names of folders.
+        rounds: how many.
+        previous: of each round, the one that it goes on from; empty: the one before.
+        methods: rows of the tables.
+        overrides: Hydra overrides as they were written.
+    """
+
+    scenes: tuple[str, ...]
+    rounds: int
+    previous: tuple[int, ...] = ()
+    methods: tuple[str, ...] = OURS
+    overrides: tuple[str, ...] = ()
+
+    def to_yaml(self) -> str:
+        """The text of params.yaml."""
+        previous = self.previous or tuple(range(self.rounds))
+        content = {
+            "scenes": list(self.scenes),
+            "rounds": [{"k": k, "prev": earlier} for k, earlier in enumerate(previous, start=1)],
+            "methods": list(self.methods),
+            "overrides": list(self.overrides),
+        }
+        return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def read_selection(project: Path) -> Selection:
+    """The selection of a project folder.
+
+    Raises:
+        UserError: one line about the first thing in its params.yaml that cannot run.
+    """
+    path = project / PARAMS
+    raw = read_user_yaml(path)
+    if not isinstance(raw, dict):
+        raise UserError("does not select a run", where=path, fix=f"it needs {', '.join(_KEYS)}")
+    for key in raw:
+        if key not in _KEYS:
+            raise UserError(f"has the unknown key {key!r}", where=path, fix=did_you_mean(str(key), _KEYS))
+    for key in _KEYS:
+        if key not in raw:
+            raise UserError(f"does not select a run ({key!r} is missing)", where=path)
+    return Selection(
+        scenes=_scenes(_list(raw, "scenes", path), f"{path}: scenes"),
+        rounds=len(_list(raw, "rounds", path)),
+        previous=_previous(_list(raw, "rounds", path), f"{path}: rounds"),
+        methods=_methods(_list(raw, "methods", path), f"{path}: methods"),
+        overrides=_texts(_list(raw, "overrides", path, may_be_empty=True), f"{path}: overrides", "adapt.steps=5"),
+    )
+
+
+def check_name(name: str, *, where: str | Path, fix: str) -> None:
+    """Raise `UserError` unless ``name`` can be the folder of a scene, in ``scenes/`` and in ``outputs/``."""
+    if not _NAME.fullmatch(name):
+        shown = name if len(name) <= 60 else f"{name[:57]}..."
+        problem = f"{shown!r} is no plain name (letters, digits, '.', '_' and '-', at most 100)"
+        raise UserError(problem, where=where, fix=fix)
+    if name.casefold() in RESERVED:
+        raise UserError(f"{name!r} is a name that the pipeline uses for its own results", where=where, fix=fix)
+
+
+def _list(raw: Mapping[str, Any], key: str, path: Path, *, may_be_empty: bool = False) -> list[Any]:
+    value = raw[key]
+    if not isinstance(value, list):
+        raise UserError("must be a list", where=f"{path}: {key}", fix=f"write {key}: [...]")
+    if not value and not may_be_empty:
+        raise UserError("is empty", where=f"{path}: {key}", fix="then nothing would run")
+    return value
+
+
+def _texts(items: list[Any], where: str, example: str) -> tuple[str, ...]:
+    for item in items:
+        if not isinstance(item, str):
+            raise UserError(f"holds {_shown(item)}, expected a list of texts such as {example}", where=where)
+    return tuple(items)
+
+
+def _distinct(items: tuple[str, ...], where: str) -> tuple[str, ...]:
+    for index, item in enumerate(items):
+        if item in items[:index]:
+            raise UserError(f"names {item!r} twice", where=where)
+    return items
+
+
+def _scenes(items: list[Any], where: str) -> tuple[str, ...]:
+    names = _texts(items, where, "courtyard")
+    for name in names:
+        check_name(name, where=where, fix="name a folder of scenes/")
+    return _distinct(names, where)
+
+
+def _methods(items: list[Any], where: str) -> tuple[str, ...]:
+    """All of them known, and none without what it starts from."""
+    methods = _texts(items, where, "sceneexpander")
+    for method in methods:
+        if method not in METHODS:
+            raise UserError(f"unknown {method!r}", where=where, fix=did_you_mean(method, METHODS))
+    for start in RIVALS:
+        if f"{start}_optimised" in methods and start not in methods:
+            raise UserError(f"'{start}_optimised' starts from {start!r}", where=where, fix=f"list {start} too")
+    return _distinct(methods, where)
+
+
+def _previous(items: list[Any], where: str) -> tuple[int, ...]:
+    """Of rounds 1, 2, ... the one that each goes on from: an earlier one, or 0, the captured scene."""
+    fix = "write {k: 1, prev: 0}, {k: 2, prev: 1}, ..."
+    if len(items) > MOST_ROUNDS:
+        raise UserError(f"are {len(items)}, more than the {MOST_ROUNDS} allowed", where=where)
+    previous = []
+    for number, item in enumerate(items, start=1):
+        if not isinstance(item, dict) or set(item) != {"k", "prev"}:
+            raise UserError(f"entry {number} is {_shown(item)}", where=where, fix=fix)
+        k, earlier = item["k"], item["prev"]
+        if type(k) is not int or k != number:  # not True, which is 1 to Python
+            raise UserError(f"entry {number} has k: {_shown(k)}, expected {number}", where=where, fix=fix)
+        if type(earlier) is not int or not 0 <= earlier < k:
+            problem = f"round {k} has prev: {_shown(earlier)}, expected an earlier round, or 0 for the captured scene"
+            raise UserError(problem, where=where, fix=fix)
+        previous.append(earlier)
+    return () if previous == list(range(len(previous))) else tuple(previous)
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

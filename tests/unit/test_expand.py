@@ -1,0 +1,329 @@
+"""A run's folder belongs to one process and to one scene; what is copied into it is what the scene names."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from PIL import Image
+
+from sceneexpander import expand as command
+from sceneexpander.errors import UserError, printable
+from sceneexpander.expand import Request, expand, run_name, stage_scene
+from sceneexpander.workspace import run_lock
+
+ROOT = Path(__file__).parents[2]
+
+
+def picture(path: Path, shade: int = 40) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (40, 30), (shade, 90, 200 - shade)).save(path, "PNG")
+    return path
+
+
+def photos(folder: Path) -> Path:
+    for number in range(3):
+        picture(folder / f"{number}.png", 40 * number)
+    return folder
+
+
+def scene(folder: Path) -> Path:
+    photos(folder / "captured")
+    picture(folder / "inserted" / "one.png", 150)
+    (folder / "scene.yaml").write_text('name: a\nrounds:\n  - prompt: "A bench."\n    inserted: inserted/one.png\n')
+    return folder
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project whose pipeline does nothing, and whose check looks at the folder only."""
+    folder = tmp_path / "project"
+    for part in ("conf", "src", "stages", ".dvc"):
+        (folder / part).mkdir(parents=True)
+        (folder / part / "file").write_text("x")
+    (folder / "params.yaml").write_text((ROOT / "params.yaml").read_text())
+    monkeypatch.setattr(command, "check_scene", lambda *_, **__: 1)
+    monkeypatch.setattr(command, "reproduce", lambda *_, **__: None)
+    return folder
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def request(source: Path, tmp_path: Path, **more: Any) -> Request:
+    given = {"inserted": (picture(tmp_path / "new.png", 150),), "prompts": ("A bench.",)}
+    return Request(photos=source, **(given | more))
+
+
+def test_the_same_photos_go_on_and_others_are_refused(project: Path, tmp_path: Path) -> None:
+    first, second = photos(tmp_path / "A" / "photos"), photos(tmp_path / "B" / "photos")
+    expand(request(first, tmp_path), project=project)
+    expand(request(first, tmp_path, prompts=("Another bench.",)), project=project)
+    folder = project / "runs" / "photos"
+    before = everything(folder)
+    with pytest.raises(UserError) as caught:
+        expand(request(second, tmp_path), project=project)
+    assert caught.value.line() == f"{folder}: holds another folder's scene ({first}); choose another --name"
+    assert everything(folder) == before
+    expand(request(second, tmp_path, name="second"), project=project)
+
+
+@pytest.mark.parametrize(("one", "two"), [("写真", "台所"), ("a b", "a_b"), ("Küche", "Kuche"), ("x" * 60, "x" * 70)])
+def test_names_that_become_one_do_not_share_a_run(one: str, two: str, project: Path, tmp_path: Path) -> None:
+    first, second = photos(tmp_path / one), photos(tmp_path / two)
+    assert run_name(request(first, tmp_path)) == run_name(request(second, tmp_path))
+    expand(request(first, tmp_path), project=project)
+    with pytest.raises(UserError, match="holds another folder's scene"):
+        expand(request(second, tmp_path), project=project)
+
+
+@pytest.mark.parametrize("name", ["pages", "report", "code.json", "Pages"])
+def test_names_of_the_pipelines_own_are_refused(name: str, project: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="uses for its own results; choose another --name"):
+        expand(request(photos(tmp_path / "in"), tmp_path, name=name), project=project)
+    with pytest.raises(UserError, match="uses for its own results; choose another --name"):
+        expand(request(photos(tmp_path / name), tmp_path), project=project)
+    assert not (project / "runs").exists()
+
+
+@contextmanager
+def somebody_at_work(folder: Path) -> Iterator[int]:
+    script = (
+        "import sys, time; from pathlib import Path; from sceneexpander.workspace import run_lock\n"
+        f"with run_lock(Path({str(folder)!r})): print('at work', flush=True); time.sleep(60)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        assert process.stdout.readline() == "at work\n"
+        yield process.pid
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_second_start_changes_nothing(project: Path, tmp_path: Path) -> None:
+    source = photos(tmp_path / "photos")
+    expand(request(source, tmp_path), project=project)
+    folder = project / "runs" / "photos"
+    before = everything(folder)
+    with somebody_at_work(folder) as process:
+        with pytest.raises(UserError) as caught:
+            expand(request(source, tmp_path, prompts=("Another bench.",)), project=project)
+        assert f"is being worked on by process {process} since 2" in caught.value.line()
+        assert everything(folder) == before
+        expand(request(source, tmp_path, name="other"), project=project)
+    expand(request(source, tmp_path), project=project)  # who was killed holds nothing
+
+
+def test_a_child_that_lives_on_holds_the_lock(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with run_lock(folder) as lock:
+        inherited = subprocess.Popen(["sleep", "60"], pass_fds=(lock.descriptor,))
+        lock.note(99999999, inherited.pid)
+    try:
+        with pytest.raises(UserError, match=f"by process {inherited.pid} since"), run_lock(folder):
+            pass
+    finally:
+        inherited.kill()
+        inherited.wait()
+    with run_lock(folder):
+        pass
+
+
+def test_a_start_that_came_to_nothing_leaves_nothing(tmp_path: Path) -> None:
+    with run_lock(tmp_path / "runs" / "run"):
+        assert list((tmp_path / "runs").iterdir())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_killed_start_leaves_no_child_and_no_lock(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    script = f"""
+from pathlib import Path
+from sceneexpander.processes import kept
+from sceneexpander.workspace import run_lock
+with run_lock(Path({str(folder)!r})) as lock:
+    with kept(["sleep", "60"], cwd=Path({str(tmp_path)!r}), held=(lock.descriptor,)) as process:
+        print(process.pid, flush=True)
+        process.wait()
+"""
+    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    int(process.stdout.readline())
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    deadline = time.monotonic() + 15
+    while True:
+        try:
+            with run_lock(folder):
+                break
+        except UserError:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+def test_a_copy_holds_what_the_scene_names(tmp_path: Path) -> None:
+    folder = scene(tmp_path / "mine")
+    (folder / "large.bin").write_bytes(b"x" * 10_000)
+    (folder / "other").mkdir()
+    os.mkfifo(folder / "pipe")
+    (folder / "loop").symlink_to(".")
+    (folder / "nowhere").symlink_to("missing")
+    (folder / "captured" / "notes.txt").write_text("x")
+    stage_scene(Request(photos=folder), "mine", tmp_path / "copy")
+    assert sorted(everything(tmp_path / "copy")) == [
+        *(f"captured/{number}.png" for number in range(3)),
+        "inserted/one.png",
+        "scene.yaml",
+    ]
+
+
+@pytest.mark.parametrize("place", ["captured", "captured/3.png", "inserted/one.png", "inserted"])
+def test_links_bring_nothing_from_elsewhere(place: str, project: Path, tmp_path: Path) -> None:
+    folder = scene(tmp_path / "mine")
+    private = photos(tmp_path / "private")
+    picture(private / "one.png")
+    path = folder / place
+    if path.is_dir():
+        path.rename(tmp_path / "away")
+    path.unlink(missing_ok=True)
+    path.symlink_to(private if path.suffix == "" else private / "0.png")
+    with pytest.raises(UserError, match="leads out"):
+        expand(Request(photos=folder), project=project)
+    assert not (project / "runs").exists()
+
+
+def test_links_within_become_files(tmp_path: Path) -> None:
+    folder = scene(tmp_path / "mine")
+    (folder / "captured" / "3.png").symlink_to("../inserted/one.png")
+    stage_scene(Request(photos=folder), "mine", tmp_path / "copy")
+    copy = tmp_path / "copy" / "captured" / "3.png"
+    assert not copy.is_symlink()
+    assert copy.read_bytes() == (folder / "inserted" / "one.png").read_bytes()
+
+
+def test_read_only_folders_run_as_often_as_one_likes(project: Path, tmp_path: Path) -> None:
+    folder = scene(tmp_path / "mine")
+    every = [folder, *folder.rglob("*")]
+    for path in every:
+        path.chmod(stat.S_IRUSR | (stat.S_IXUSR if path.is_dir() else 0))
+    (project / "conf").chmod(0o555)
+    try:
+        for _ in range(3):
+            expand(Request(photos=folder), project=project)
+    finally:
+        for path in every:
+            path.chmod(0o755)
+        (project / "conf").chmod(0o755)
+    copies = [path for part in ("scenes", "conf") for path in (project / "runs" / "mine" / part).rglob("*")]
+    assert len(copies) >= 6
+    assert all(path.stat().st_mode & stat.S_IWUSR for path in copies)
+    assert not list((project / "runs").glob("*.part"))
+
+
+def test_what_a_killed_start_left_is_cleared(project: Path, tmp_path: Path) -> None:
+    left = project / "runs" / ".photos.abc.part"
+    photos(left)
+    expand(request(photos(tmp_path / "photos"), tmp_path), project=project)
+    assert not left.exists()
+
+
+UGLY = ["it's #1.PNG", 'b=a (1) "x" ${Y}.png', "{round}.png", "写真.jpg", "a\nb.png", "noending", "x.weird ending"]
+
+
+@pytest.mark.parametrize("name", UGLY)
+def test_a_picture_of_any_name_is_inserted(name: str, tmp_path: Path) -> None:
+    given = picture(tmp_path / "in, #1" / name, 150)
+    source = Request(photos=photos(tmp_path / "photos"), inserted=(given,), prompts=("A ${seed} 'bench' #5.",))
+    stage_scene(source, "mine", tmp_path / "copy")
+    facts = yaml.safe_load((tmp_path / "copy" / "scene.yaml").read_text())["rounds"][0]
+    assert facts["prompt"] == "A ${seed} 'bench' #5."
+    assert (tmp_path / "copy" / facts["inserted"]).read_bytes() == given.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["c.jpg", "c\nd\x1b[2J.jpg"])
+def test_the_last_lines_say_what_became_of_the_photos(
+    name: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ran(folder: Path, **_: object) -> None:
+        cameras = {"summary": f"2 of 3 photos used: {name} left out (its matches agree with no camera)"}
+        page = folder / "outputs" / "pages" / "photos" / "page.json"
+        page.parent.mkdir(parents=True)
+        page.write_text(json.dumps({"cameras": cameras, "rounds": [{"number": 1, "cameras": None}]}))
+
+    monkeypatch.setattr(command, "reproduce", ran)
+    monkeypatch.setattr(command, "find_project", lambda: project)
+    inserted = picture(tmp_path / "new.png", 150)
+    arguments = [str(photos(tmp_path / "photos")), "--inserted", str(inserted), "--prompt", "A bench."]
+    monkeypatch.setattr(sys, "argv", ["expand", *arguments])
+    command.main()
+    assert capsys.readouterr().out.splitlines() == [
+        f"photos: 2 of 3 photos used: {printable(name)} left out (its matches agree with no camera)",
+        f"report: {project / 'runs' / 'photos' / 'outputs' / 'report' / 'index.html'}",
+    ]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "nothing", "long"])
+def test_what_is_no_picture_is_one_line(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "there"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    path = {"device": Path("/dev/zero"), "long": tmp_path / ("x" * 5000)}.get(kind, path)
+    with pytest.raises(UserError):
+        stage_scene(Request(photos=photos(tmp_path / "p"), inserted=(path,), prompts=("A.",)), "m", tmp_path / "copy")
+
+
+@pytest.mark.parametrize("words", [{"prompts": ("A\udcff.",)}, {"motions": ("\ud800",)}, {"name": "\udcff"}])
+def test_words_that_are_no_text_are_one_line(words: dict[str, Any], project: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="not valid text"):
+        expand(request(photos(tmp_path / "photos"), tmp_path, **words), project=project)
+    assert not (project / "runs").exists()
+
+
+def test_errors_name_the_users_files(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = photos(tmp_path / "photos")
+    for place, named in (("captured/1.png", source / "1.png"), ("inserted/round_1.png", tmp_path / "new.png")):
+
+        def refuse(_: str, folder: Path, *, place: str = place, **__: object) -> int:
+            raise UserError("is bad", where=folder / place)
+
+        monkeypatch.setattr(command, "check_scene", refuse)
+        with pytest.raises(UserError) as caught:
+            expand(request(source, tmp_path), project=project)
+        assert caught.value.where == str(named)
+    assert not (project / "runs" / "photos").exists()
+
+
+def test_a_full_disk_leaves_the_earlier_run(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import shutil
+
+    source = photos(tmp_path / "photos")
+    expand(request(source, tmp_path), project=project)
+    before = everything(project / "runs")
+
+    def full(_: Any, target: Any, **__: object) -> None:
+        Path(target).write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device", str(target))
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(OSError, match="No space left"):
+        expand(request(source, tmp_path), project=project)
+    assert everything(project / "runs") == before
+    assert json.loads((project / "runs" / "photos" / "source.json").read_text())["photos"] == str(source)

@@ -1,0 +1,135 @@
+"""Commands over many runs: what they are asked for is checked first, and a table is never replaced by an empty one."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+
+from sceneexpander import ablation, sweep, ui
+from sceneexpander.errors import UserError
+from sceneexpander.expandbench.run import CellResult, Plan, Settings
+from sceneexpander.sweep import check_axes, run_hydra
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (["--multirun", "nope=1"], "nope: unknown key"),
+        (["--multirun", "adapt.stepz=1,2"], "adapt.stepz: unknown key; did you mean 'adapt.steps'?"),
+        (["--multirun", "ablation=full,ful"], "ablation: has no option 'ful'; did you mean 'full'?"),
+        (["--multirun", "ablation=glob(zz*)"], "stands for no value"),
+        (["--multirun", "adapt.steps=5,abc"], "adapt.steps: is 'abc' (str), expected a whole number"),
+        (["adapt.steps=abc"], "adapt.steps: is 'abc' (str)"),
+        (["foo"], "foo: is not a setting"),
+        (["--mutirun", "seed=1"], "did you mean '--multirun'?"),
+        (["--multirun", "seed=range(1"], "seed=range(1"),
+        *(([f"seed={text}"], "seed") for text in ("9" * 5000, "1," + "9" * 5000)),
+        (["--multirun", f"seed={'[' * 400}{']' * 400}"], "nested too deeply"),
+        (["--multirun", "seed=range(1,1e99)"], "more than 1000 values"),
+        (["--multirun", "seed=shuffle(range(1,1000000000))"], "more than 1000 values"),
+        (["--multirun", "seed=range(0,3,0)"], "step is 0"),
+        (["--multirun", "adapt.steps=interval(1,2)"], "is a range without steps"),
+        (["hydra.nope=1"], "hydra.nope"),
+        (["hydra/launcher=nope"], "hydra/launcher"),
+        (["seed=${oc.env:HOME}"], "environment variable"),
+        (["hydra.run.dir=${oc.env:HOME}"], "environment variable"),
+    ],
+)
+def test_what_there_is_not_is_one_line(given: list[str], line: str) -> None:
+    with pytest.raises(UserError) as caught:
+        check_axes(given, ROOT)
+    assert line in caught.value.line()
+    assert "\n" not in caught.value.line()
+    assert len(caught.value.line()) < 500
+
+
+def test_good_axes_pass_as_they_are() -> None:
+    given = ["--multirun", "ablation=glob(realign*)", "seed=0,1", "adapt.steps=range(2,8,2)", "hydra/launcher=parallel"]
+    if not (ROOT / "conf" / "hydra" / "launcher" / "parallel.yaml").is_file():
+        given.pop()
+    assert check_axes(given, ROOT) == given
+
+
+def test_a_file_with_any_name_is_one_value(tmp_path: Path) -> None:
+    path = tmp_path / "a, b.png"
+    path.write_text("x")
+    items = check_axes(["generator=file", f"generator.file={path}"], ROOT)
+    assert items[1] == f"generator.file='{path}'"
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["sweep"])
+    monkeypatch.setattr(sweep, "run_job", lambda *_, **__: None)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(UserError, match=r"sceneexpander\.sweep"):
+        run_hydra([f"hydra.run.dir={tmp_path / 'file' / 'x'}"], ROOT)
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The configuration, and a table of an earlier run."""
+    monkeypatch.setenv("SCENEEXPANDER_ROOT", str(tmp_path))
+    (tmp_path / "conf").symlink_to(ROOT / "conf")
+    (tmp_path / "src").symlink_to(ROOT / "src")
+    (tmp_path / "dvc.yaml").write_text("stages: {}")
+    (tmp_path / "results").mkdir()
+    for ending in ("json", "md", "svg"):
+        (tmp_path / "results" / f"ablation.{ending}").write_text("kept")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ["--finished"],
+        ["--rows", ""],
+        ["--rows", ","],
+        ["--seeds", ""],
+        ["--grades", ""],
+        ["--scenes", ""],
+        ["--finished", "--any-code", "--scenes", ""],
+    ],
+)
+def test_an_empty_table_replaces_none(
+    given: list[str], project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["ablation", *given])
+
+    def nothing_found(_: Plan, settings: Settings, **__: object) -> list[CellResult]:
+        assert settings.finished_only, "a plan of nothing is refused before it runs"
+        return []
+
+    monkeypatch.setattr(ablation, "run", nothing_found)
+    with pytest.raises(SystemExit) as caught:
+        ablation.main()
+    assert caught.value.code == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert {path.read_text() for path in (project / "results").iterdir()} == {"kept"}
+
+
+@pytest.mark.parametrize("port", [0, -1, 65536])
+def test_a_port_is_one(port: int) -> None:
+    with pytest.raises(UserError, match="--port"):
+        ui.check_port(port)
+
+
+def test_a_port_in_use_is_one_line() -> None:
+    with socket.socket() as other:
+        other.bind((ui.HOST, 0))
+        other.listen()
+        with pytest.raises(UserError, match="cannot be used"):
+            ui.check_port(other.getsockname()[1])
+
+
+def test_a_root_that_is_none_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sceneexpander.project import find_project
+
+    monkeypatch.setenv("SCENEEXPANDER_ROOT", str(tmp_path / "gone"))
+    with pytest.raises(UserError, match=r"SCENEEXPANDER_ROOT=.* holds no pipeline"):
+        find_project()
