@@ -63,8 +63,13 @@ class CameraReport:
 
     def problems(self) -> tuple[str, ...]:
         """A line for everything that is not as it should be: views left out or rough, warnings, notes."""
-        lines = [f"{v.name}: {'left out, ' if not v.posed else ''}{v.reason}" for v in self.views if v.reason]
-        lines += [f"{v.name}: {warning}" for v in self.views for warning in v.warnings]
+        lost = [f"{view.name}: left out, {view.reason}" for view in self.views if not view.posed]
+        return (*lost, *self.remarks())
+
+    def remarks(self) -> tuple[str, ...]:
+        """What `summary` does not say: views that are only roughly right, warnings, notes."""
+        lines = [f"{view.name}: roughly placed, {view.reason}" for view in self.views if view.posed and view.reason]
+        lines += [f"{view.name}: {warning}" for view in self.views for warning in view.warnings]
         return (*lines, *self.notes)
 
     def save(self, folder: Path) -> None:

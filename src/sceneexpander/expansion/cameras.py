@@ -75,5 +75,5 @@ def announce_cameras(report: CameraReport, *, strict: bool) -> None:
         raise UserError(
             f"{problems[0]}{more}", where="cameras", fix="take the photo out, or set frontend.strict=false to go on"
         )
-    for line in problems:
+    for line in report.remarks():
         _log.warning("%s", line)

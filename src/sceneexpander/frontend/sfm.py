@@ -55,6 +55,7 @@ __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "esti
 
 _SURE_OF_A_TURN = 50  # matches of descriptors that one rotation explains, for learned ones to have no say in it
 _MOST_MIRRORS = 4  # views without a camera that are tried mirrored
+_NEARBY = (1.0, 0.75, 1.33)  # focals to begin from, as factors of one that another model has found
 _NOTHING_SHARED = "no other photo shares enough with it"
 Judge = Callable[[SparseReconstruction], float]
 
@@ -162,7 +163,12 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
     refused: dict[int, str] = {}
     if mapping.valid.any() and plan.known is None:
         evidence = weigh_evidence(mapping, model.features, model.pairs, hinted)
-        refused = {view: reason for view, found in evidence.items() if (reason := found.refusal(config))}
+        # A generated picture need not agree with the place: whether it fits is asked elsewhere, with what it is for in mind.
+        refused = {
+            view: reason
+            for view, found in evidence.items()
+            if not plan.generated[view] and (reason := found.refusal(config))
+        }
         for view in refused:
             mapping.leave_out(view)
         if refused and mapping.registered.sum() >= 2:
@@ -347,18 +353,27 @@ def _learned_models(
         for pair, kind in zip(model.pairs, model.kinds, strict=True)
         if kind is PairKind.ROTATION and pair.verified.count >= _SURE_OF_A_TURN
     )
+    nearby = _starts_near(model, plan)
     return [
         _model(
             features,
             _Learned(matches=matches, lead=lead, turns=turns),
             known,
-            plan,
+            nearby,
             config,
             setup,
             distortion=model.distortion,
         )
         for lead in leading
     ]
+
+
+def _starts_near(model: _Model, plan: LensPlan) -> LensPlan:
+    """The plan with focals to begin from near the one that a model has found; as it is if that one is a guess."""
+    if model.focal_source is not FocalSource.REFINED or len(plan.starts) <= len(_NEARBY):
+        return plan
+    ratio = float(model.mapping.intrinsics[model.mapping.main, 0, 0] / plan.units_px[model.mapping.main, 0])
+    return replace(plan, starts=tuple(replace(plan.starts[0], ratio=ratio * factor) for factor in _NEARBY))
 
 
 def _pairs_worth_matching(model: _Model, keypoints: list[LearnedKeypoints], config: SfmConfig) -> list[tuple[int, int]]:
