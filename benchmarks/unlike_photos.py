@@ -330,6 +330,18 @@ def plain(place: Place) -> list[Photo]:
 
 
 @case
+def two_photos(place: Place) -> list[Photo]:
+    """All alike, but only two."""
+    return _plain(place)[-2:]
+
+
+@case
+def three_photos(place: Place) -> list[Photo]:
+    """All alike, but only three."""
+    return _plain(place)[-3:]
+
+
+@case
 def phone_level(place: Place) -> list[Photo]:
     """The control of the next ones: one phone, all photos level."""
     return _phone(place, ())
