@@ -56,8 +56,8 @@ class Shot:
 
     pose: tuple[tuple[float, ...], ...]
     focal_px: float
-    height: int = HEIGHT
-    width: int = WIDTH
+    height: int
+    width: int
     distortion: tuple[float, float] = (0.0, 0.0)  # k1, k2: distorted = undistorted (1 + k1 r^2 + k2 r^4)
 
     @property
@@ -91,7 +91,7 @@ def place_of(seed: str) -> Place:
         if cameras.disconnected is not None:
             raise ValueError(f"seed {seed}: a view of this set shares nothing with the others")
         poses, focal = cameras.world_from_cam, float(cameras.intrinsics_px[0, 0, 0]) / LONG
-    small = np.diag([0.25, 0.25, 1.0]) @ Shot(pose=(), focal_px=focal * LONG).intrinsics
+    small = np.diag([0.25, 0.25, 1.0]) @ Shot(pose=(), focal_px=focal * LONG, height=HEIGHT, width=WIDTH).intrinsics
     lenses = np.broadcast_to(small, (len(poses), 3, 3))
     preview = render_world(world, poses, lenses, HEIGHT // 4, WIDTH // 4, supersample=1.0)
     coarse = np.stack([cv2.resize(depth, (32, 24), interpolation=cv2.INTER_NEAREST) for depth in preview.depth])
@@ -127,9 +127,15 @@ def _aimed(place: Place, focal_ratio: float) -> NDArray[np.float64]:
 # --- photos ------------------------------------------------------------------------------------------------------------------------
 
 
-def shot(pose: Pose, focal_ratio: float, **more: Any) -> Shot:
-    """A shot with a focal in long sides of a whole frame."""
-    return Shot(pose=tuple(tuple(float(x) for x in row) for row in pose), focal_px=focal_ratio * LONG, **more)
+def shot(pose: Pose, focal_ratio: float, *, turned: bool = False, distortion: tuple[float, float] = (0.0, 0.0)) -> Shot:
+    """A shot with a focal in long sides of the frame; ``turned`` with the frame on end."""
+    return Shot(
+        pose=tuple(tuple(float(x) for x in row) for row in pose),
+        focal_px=focal_ratio * LONG,
+        height=WIDTH if turned else HEIGHT,
+        width=HEIGHT if turned else WIDTH,
+        distortion=distortion,
+    )
 
 
 @lru_cache(maxsize=96)
@@ -288,9 +294,8 @@ def _shots(poses: NDArray[np.float64], focal_ratios: Sequence[float] | float, pl
 
 def _phone(place: Place, turned: Sequence[int], views: int = VIEWS) -> list[Photo]:
     """One phone, held level or turned by a quarter: same focal in pixels, same long side."""
-    frames = [(WIDTH, HEIGHT) if k in turned else (HEIGHT, WIDTH) for k in range(views)]
     poses = place.world_from_cam[-views:]
-    return [take(place, shot(p, PHONE, height=h, width=w)) for p, (h, w) in zip(poses, frames, strict=True)]
+    return [take(place, shot(pose, PHONE, turned=k in turned)) for k, pose in enumerate(poses)]
 
 
 def _with(photos: list[Photo], change: Callable[[Photo], Photo], *which: int) -> list[Photo]:
@@ -322,6 +327,18 @@ def _elsewhere(number: int) -> Pixels:
 def plain(place: Place) -> list[Photo]:
     """The control."""
     return _plain(place)
+
+
+@case
+def two_photos(place: Place) -> list[Photo]:
+    """All alike, but only two."""
+    return _plain(place)[-2:]
+
+
+@case
+def three_photos(place: Place) -> list[Photo]:
+    """All alike, but only three."""
+    return _plain(place)[-3:]
 
 
 @case
