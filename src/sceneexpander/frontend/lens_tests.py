@@ -129,7 +129,7 @@ def pair_costs(
 
 
 def snap_lenses(mapping: Mapping) -> bool:
-    """Let focals that come near a likely one (the same field of view, the same focal in original pixels) be exactly that.
+    """Let focals that come near a likely one (the main lens's, the same focal in original pixels, ...) be exactly that.
 
     Two photos cut to another shape tell their common focal worse than all photos together tell the one that they were cut from.
     """
@@ -137,10 +137,10 @@ def snap_lenses(mapping: Mapping) -> bool:
     main = mapping.lens_of[mapping.main]
     for lens in np.unique(mapping.lens_of[mapping.registered]):
         view = int(np.flatnonzero(mapping.lens_of == lens)[0])
-        if lens == main or view not in mapping.lens_guesses or mapping.lenses.focal_of[lens] != lens:
+        if lens == main or mapping.lenses.focal_of[lens] != lens:
             continue
         apart = float(mapping.log_focal[view] - mapping.log_focal[mapping.main])
-        nearest = min((0.0, *mapping.lens_guesses[view]), key=lambda guess: abs(guess - apart))
+        nearest = min((0.0, *mapping.lens_guesses.get(view, ())), key=lambda guess: abs(guess - apart))
         if abs(nearest - apart) < _SNAP:
             mapping.follow_focal(view, mapping.main, nearest)
             changed = True

@@ -8,7 +8,7 @@ has another size and gets a focal of its own, which the pictures must find; so h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from sceneexpander.errors import UserError
 from sceneexpander.frontend.sfm_setup import KnownCameras, Setup
 from sceneexpander.frontend.sfm_types import FocalSource, SfmConfig
+from sceneexpander.frontend.vanishing import vanishing_focal
 
 _USUAL_FOCALS = 1.8  # standard deviations around the prior: focals that few views may choose among
 _CROP_SLACK = 0.01  # of the long side: no lens has its principal point exactly in the middle
@@ -170,7 +171,14 @@ class LensPlan:
             originals_px=np.array([own.long_side for own in optics], np.float64),
             focal_hints=hints,
             generated=np.array([own.generated for own in optics]),
-            starts=_starts(config, hints[main], known, units, setup),
+            starts=_starts(
+                config,
+                hints[main],
+                _lines_focal(config, hints[main], known, lens_of, main, units, setup),
+                known,
+                units,
+                setup,
+            ),
             nominal=_nominal(config, hints, lens_of, centres, units) if known.intrinsics is None else known.intrinsics,
             known=known.intrinsics,
             refine=known.intrinsics is None or config.refine_known_intrinsics,
@@ -208,8 +216,34 @@ def _hints(lens_of: np.ndarray, optics: Sequence[ViewOptics]) -> np.ndarray:
     return hints
 
 
+def _lines_focal(
+    config: SfmConfig,
+    hint: float,
+    known: KnownCameras,
+    lens_of: np.ndarray,
+    main: int,
+    units: np.ndarray,
+    setup: Setup,
+) -> FocalStart | None:
+    """The focal at which the straight lines of the main lens's pictures meet in three directions at right angles, if they say one.
+
+    Where there are few views this is worth more than any guess; where there are many it is one more place to begin.
+    """
+    if known.intrinsics is not None or np.isfinite(hint) or not 1 < len(lens_of) <= config.choose_most_views:
+        return None
+    views = np.flatnonzero(lens_of == main)
+    views = views[np.isclose(units[views, 0], units[views[0], 0])]
+    found = vanishing_focal([setup.colours[view] for view in views.tolist()])
+    if found is None or found.sigma > config.focal_lines_sigma:
+        return None
+    ratio = found.focal_ratio * setup.long_side / float(units[views[0], 0])
+    if not config.focal_bounds[0] <= ratio <= config.focal_bounds[1]:
+        return None
+    return FocalStart(ratio=ratio, prior=ratio, sigma=found.sigma, penalty=0.0, source=FocalSource.LINES)
+
+
 def _starts(
-    config: SfmConfig, hint: float, known: KnownCameras, units: np.ndarray, setup: Setup
+    config: SfmConfig, hint: float, lines: FocalStart | None, known: KnownCameras, units: np.ndarray, setup: Setup
 ) -> tuple[FocalStart, ...]:
     if known.intrinsics is not None:
         ratio = float(known.intrinsics[0, 0, 0]) / setup.long_side
@@ -229,6 +263,11 @@ def _starts(
         for ratio in config.focal_starts
         if len(units) >= config.min_views_for_focal or abs(np.log(ratio / config.focal_prior)) < usual
     )
+    if lines is not None and len(units) >= config.min_views_for_focal:
+        # The pictures decide; lines bent by the lens or a crop would mislead as a prior.
+        return (*guesses, replace(lines, prior=config.focal_prior, sigma=config.focal_prior_sigma, source=None))
+    if lines is not None:
+        return (lines,)
     if unsaid:
         return guesses
     said = FocalStart(

@@ -221,6 +221,8 @@ def _notes(mapping: Mapping, source: FocalSource) -> tuple[str, ...]:
         notes.append("no point could be triangulated: the views share no matches with parallax")
     if source is FocalSource.SWEPT:
         notes.append("the focal is the best of a few plausible values: too few views to refine it")
+    if source is FocalSource.LINES:
+        notes.append("the focal is the one that straight lines in the pictures agree on: too few views to refine it")
     if source is FocalSource.TURNED:
         notes.append("the focal is the one at which the camera only turned: without parallax there is no depth")
     if source is FocalSource.ASSUMED:

@@ -87,6 +87,9 @@ class SfmConfig:
     focal_prior: _Focal = 0.85  # phones .7-.75, 35-50 mm lenses 1-1.4, wide lenses .5-.6
     focal_prior_sigma: Annotated[float, Range(0, 10, low_open=True)] = 0.25  # of the logarithm
     focal_hint_sigma: Annotated[float, Range(0, 10, low_open=True)] = 0.03  # of the logarithm, around a focal from EXIF
+    focal_lines_sigma: Annotated[float, Range(0, 10)] = (
+        0.12  # of the logarithm: focals of vanishing lines less certain are not used
+    )
     focal_hint_penalty: Weight = 60.0  # observations that another focal must explain beyond those that EXIF's does
     generated_focal_sigma: Annotated[float, Range(0, 10, low_open=True)] = (
         0.1  # of the logarithm: a generated picture's focal around that of the photos
@@ -176,6 +179,7 @@ class FocalSource(StrEnum):
     KNOWN = "known"  # given intrinsics, kept
     REFINED = "refined"  # bundle adjustment
     HINT = "hint"  # given focal, kept
+    LINES = "lines"  # vanishing lines of architecture, kept
     SWEPT = "swept"  # the best of the starts, kept because there are too few views to refine it
     TURNED = "turned"  # the one that makes a camera without parallax turn as a rigid body does
     ASSUMED = "assumed"  # nothing, or too little, to estimate it from: the prior

@@ -18,6 +18,7 @@ _FOCAL_SOURCES = {
     "refined": "refined on the photos",
     "hint": "from the file",
     "exif": "from the file",
+    "lines": "from straight lines in the photos",
     "swept": "the best of some guesses",
     "turned": "from turns of the camera",
     "assumed": "assumed",
