@@ -173,6 +173,8 @@ class CameraSearch:
             whole.register(view)
         whole.grow(refine_focal=True)
         self._finish(whole, True)
+        if snap_lenses(whole):
+            self._finish(whole, True)
         now = pair_costs(whole, self.features, self.pairs)
         others = [view for view in np.flatnonzero(whole.registered) if view not in group]
         usual = mean_cost(now[np.ix_(others, others)])
