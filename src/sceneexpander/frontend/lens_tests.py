@@ -152,7 +152,8 @@ class _LensCheck:
 
     def __init__(self, mapping: Mapping, view: int, others: Sequence[OtherView]) -> None:
         self.mapping, self.view = mapping, view
-        self.alone = int((mapping.lens_of == mapping.lens_of[view]).sum()) == 1
+        holder = mapping.lenses.focal_of[mapping.lens_of]
+        self.alone = int((holder == holder[view]).sum()) == 1
         self.fit = EpipolarFit(
             others,
             mapping.start_intrinsics[view],

@@ -269,7 +269,8 @@ class Mapping:
             seed=self.seed,
         )
         found = None if pose is None else judge_view(sighting, pose[0], pose[1], current)
-        alone = not (self.registered & (self.lens_of == self.lens_of[view])).any()
+        holder = self.lenses.focal_of[self.lens_of]
+        alone = not (self.registered & (holder == holder[view])).any()
         agreeing = 0 if found is None else int(found.inlier.sum())
         if alone or agreeing < self.config.focal_doubt_share * len(rows):
             other = resect(sighting, self.log_focals_to_try(view, alone))

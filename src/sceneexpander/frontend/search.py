@@ -225,6 +225,8 @@ class CameraSearch:
             hinted = bool(np.isfinite(plan.focal_hints[lens])) and start.source is not None
             sigma[view, LOG_FOCAL] = config.focal_hint_sigma if hinted else config.split_focal_sigma
             if plan.generated[view]:
+                # Drawn after the photos, with their field of view; a wrong one shows when its matches are looked at.
+                lenses.focal_of[view] = plan.main
                 sigma[view, LOG_FOCAL] = config.generated_focal_sigma
         return Mapping(
             tracks,

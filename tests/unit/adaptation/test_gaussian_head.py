@@ -53,7 +53,7 @@ def test_a_head_that_does_not_help_is_taken_back() -> None:
     model = TinyReconstructor()
     start = {name: value.clone() for name, value in model.state_dict().items()}
     report = fit_gaussian_head(
-        model, tiny_images(3), GENERATED, None, replace(CONFIG, splat_learning_rate=1e4, splat_steps=1), seed=0
+        model, tiny_images(3), GENERATED, None, replace(CONFIG, splat_learning_rate=1.0, splat_steps=1), seed=0
     )
     assert report is not None
     if not report.accepted:
