@@ -60,6 +60,8 @@ class ViewEvidence:
 
     def doubt(self, config: SfmConfig) -> str:
         """Why the camera is only roughly right; empty if there is no such reason."""
+        if self.agreeing < config.sure_agreeing:
+            return f"only {self.agreeing:.0%} of its matches with other photos agree with its camera"
         if self.direction_sigma_deg > config.max_direction_deg:
             return (
                 "the photos were taken from nearly one place: directions between cameras may be off by"

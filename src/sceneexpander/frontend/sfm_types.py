@@ -144,7 +144,8 @@ class SfmConfig:
     bundle_iterations: Annotated[int, Range(1, 10_000)] = 40
 
     # Evidence that a camera must have.
-    min_agreeing: Share = 0.5  # share of a view's verified matches that agree with the model
+    min_agreeing: Share = 0.5  # share of a view's verified matches that agree with the model, or it is left out
+    sure_agreeing: Share = 0.7  # the same for a camera that is not called rough
     # Between the model's relative rotations and those of single pairs, whose planes and few matches make them rough: median over pairs.
     max_rotation_gap_deg: Annotated[float, Range(0, 180)] = 20.0
     # Predicted error of directions (standard deviation, median over the other views): beyond it a camera is rough.
