@@ -309,7 +309,7 @@ def compare(
             true_camera=photo.world_from_cam is not None,
             posed=bool(found.posed[index]),
             sure=bool(found.posed[index]) and not report.loose,
-            remark=report.reason,
+            remark="; ".join([*([report.reason] if report.reason else []), *report.warnings]),
             focal_ratio=float(mine[0, 0]) / long_side,
         )
         if photo.world_from_cam is not None:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from sceneexpander.frontend.bundle import LOG_FOCAL
-from sceneexpander.frontend.epipolar import EpipolarFit, OtherView, held_lens
+from sceneexpander.frontend.bundle import LOG_FOCAL, SHIFT_X, SHIFT_Y
+from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, OtherView, held_lens
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.sfm_types import SfmConfig
@@ -22,9 +22,11 @@ from sceneexpander.frontend.twoview import PairMatches, relative_pose
 
 _AGREE_PX = 3.0  # at 768 px: a match this near its epipolar lines agrees with the cameras
 _MIN_MATCHES = 30  # fewer say nothing about a camera
-_OWN_FOCAL_SIGMA = (
-    0.02  # of the logarithm: how well pictures tell the focal of a single view, measured on zoomed photos
-)
+# How well pictures tell the focal (logarithm) and the centre (of the long side) of a single view, measured on zoomed and cropped photos;
+# of the focal less where only less still fits.
+_FOCAL_STEPS = (0.02, 0.01, 0.005)
+_SHIFT_STEPS = (0.02,)
+_STILL_FITS = 1.15  # times what is unexplained at the best focal
 _NOISE_PX = 0.5  # at 768 px: systematic errors of keypoints that the scatter of their errors does not show
 
 
@@ -36,14 +38,14 @@ class ViewEvidence:
         agreeing: share of its matches, as verified before any camera was known, that lie on the epipolar lines of the model.
         rotation_gap_deg: median over the other views of the angle between the model's relative rotation and that of the pair alone.
         direction_sigma_deg: median over the other views of how far the direction to them may be off (one standard deviation).
-        focal_sigma_deg: how far the directions to the others move if its focal is off by as much as pictures alone leave it uncertain;
-            0 where the focal is shared or known from elsewhere.
+        lens_sigma_deg: how far the directions to the others move if its focal, or its centre if it was cropped, is off by as much as
+            pictures alone leave it uncertain; 0 where they are shared or known from elsewhere.
     """
 
     agreeing: float
     rotation_gap_deg: float
     direction_sigma_deg: float
-    focal_sigma_deg: float
+    lens_sigma_deg: float
 
     def refusal(self, config: SfmConfig) -> str:
         """Why the camera cannot be believed; empty if it can."""
@@ -51,10 +53,10 @@ class ViewEvidence:
             return f"only {self.agreeing:.0%} of its matches with other photos agree with any camera"
         if self.rotation_gap_deg > config.max_rotation_gap_deg:
             return f"its turns against other photos contradict each other by {self.rotation_gap_deg:.0f} degrees"
-        if self.focal_sigma_deg > config.max_own_direction_deg:
+        if self.lens_sigma_deg > config.max_own_direction_deg:
             return (
-                "it was taken with another focal length (zoomed or cropped), which the pictures tell too roughly:"
-                f" its direction may be off by {self.focal_sigma_deg:.0f} degrees"
+                "it was zoomed or cropped, and the pictures tell too roughly how:"
+                f" its direction may be off by {self.lens_sigma_deg:.0f} degrees"
             )
         return ""
 
@@ -92,10 +94,8 @@ def weigh_evidence(
             agreeing=_agreeing_share(mapping, view, features, pairs),
             rotation_gap_deg=float(np.median(turned)) if len(turned) >= 2 else float("nan"),
             direction_sigma_deg=float(np.median(row)) if len(row) else float("nan"),
-            focal_sigma_deg=(
-                _focal_sigma_deg(mapping, view, features, pairs)
-                if _focal_is_own(mapping, view) and not hinted[view]
-                else 0.0
+            lens_sigma_deg=_lens_sigma_deg(
+                mapping, view, features, pairs, _own_parameters(mapping, view, hinted=hinted[view])
             ),
         )
     return found
@@ -166,8 +166,16 @@ def _rotation_gaps_deg(
     return gaps
 
 
-def _focal_sigma_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
-    """Median over the other views of the angle by which the direction to them moves between two focals that both fit."""
+def _lens_sigma_deg(
+    mapping: Mapping,
+    view: int,
+    features: Sequence[Features],
+    pairs: Sequence[PairMatches],
+    parameters: Sequence[int],
+) -> float:
+    """By how much the directions to the others (their median) move between two values of a lens parameter that both fit; the worst one."""
+    if not parameters:
+        return 0.0
     others = other_views(mapping, view, features, pairs)
     if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
         return 180.0
@@ -177,17 +185,39 @@ def _focal_sigma_deg(mapping: Mapping, view: int, features: Sequence[Features], 
         mapping.shift_unit_px[view],
         noise_px=_NOISE_PX * mapping.unit_px,
     )
-    centres = []
-    for step in (-_OWN_FOCAL_SIGMA, _OWN_FOCAL_SIGMA):
-        lens = mapping.lenses.resolved[mapping.lens_of[view]].copy()
-        lens[LOG_FOCAL] += step
-        found = fit.refine(mapping.rotations[view], mapping.translations[view], lens, held_lens())
-        centres.append(-found.rotation.T @ found.translation)
-    angles = []
-    for other in others:
-        a, b = (centre + other.rotation.T @ other.translation for centre in centres)
-        angles.append(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)) / 2)
-    return float(np.median(angles))
+    lens = mapping.lenses.resolved[mapping.lens_of[view]]
+    best = fit.refine(mapping.rotations[view], mapping.translations[view], lens, held_lens())
+    worst = 0.0
+    for parameter in parameters:
+        ends = [_end_of(fit, best, parameter, sign) for sign in (-1.0, 1.0)]
+        centres = [-end.rotation.T @ end.translation for end in ends]
+        angles = []
+        for other in others:
+            a, b = (centre + other.rotation.T @ other.translation for centre in centres)
+            angles.append(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)) / 2)
+        worst = max(worst, float(np.median(angles)))
+    return worst
+
+
+def _end_of(fit: EpipolarFit, best: EpipolarView, parameter: int, sign: float) -> EpipolarView:
+    """The view with one lens parameter as far off as still fits, of the sizes that are usual."""
+    found = best
+    for size in _FOCAL_STEPS if parameter == LOG_FOCAL else _SHIFT_STEPS:
+        lens = best.lens.copy()
+        lens[parameter] += sign * size
+        found = fit.refine(best.rotation, best.translation, lens, held_lens())
+        if found.cost < _STILL_FITS * best.cost:
+            break
+    return found
+
+
+def _own_parameters(mapping: Mapping, view: int, *, hinted: bool) -> list[int]:
+    """Lens parameters that nothing but this view's pictures tell."""
+    own = [LOG_FOCAL] if _focal_is_own(mapping, view) and not hinted else []
+    lens = mapping.lens_of[view]
+    if mapping.lenses.free[lens, SHIFT_X] and int((mapping.lens_of == lens).sum()) == 1:
+        own += [SHIFT_X, SHIFT_Y]
+    return own
 
 
 def _focal_is_own(mapping: Mapping, view: int) -> bool:

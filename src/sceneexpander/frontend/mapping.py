@@ -452,11 +452,16 @@ class Mapping:
         self.lenses = replace(self.lenses, focal_of=focal_of, offset=offsets)
 
     def let_shift(self, view: int, sigma: float) -> None:
-        """From now on refine the principal point of a view's lens, too."""
+        """From now on refine the principal point of a view's lens, too: of a part of a picture within what can have been cut off."""
+        row, columns = self.lens_of[view], slice(SHIFT_X, SHIFT_Y + 1)
         free, prior_sigma = self.lenses.free.copy(), self.prior_sigma.copy()
-        free[self.lens_of[view], SHIFT_X : SHIFT_Y + 1] = True
-        prior_sigma[self.lens_of[view], SHIFT_X : SHIFT_Y + 1] = sigma
-        self.lenses, self.prior_sigma = replace(self.lenses, free=free), prior_sigma
+        low, high = self.lenses.low.copy(), self.lenses.high.copy()
+        free[row, columns], prior_sigma[row, columns] = True, sigma
+        crop = self.crops.get(view)
+        if crop is not None:
+            high[row, columns] = crop.limit_x, crop.limit_y
+            low[row, columns] = -high[row, columns]
+        self.lenses, self.prior_sigma = replace(self.lenses, free=free, low=low, high=high), prior_sigma
 
     def _problem(
         self,
