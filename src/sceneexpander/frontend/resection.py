@@ -27,9 +27,6 @@ from sceneexpander.frontend.twoview import MOST_SAMPLES, usac_parameters
 _MIN_POINTS = 8  # a pose and a focal have seven unknowns: four points fix them, chance can fit a few more
 _SWEEP_SAMPLES = 400  # of the robust fit, while focals are tried: the best one is refined afterwards
 _SWEEP_POINTS = 300  # used meanwhile
-_MAX_SHIFT = (
-    0.6  # of the original's long side: a crop that keeps a corner of a quarter of the area moves the centre by half
-)
 _WIDE = 2.0  # times the inlier threshold: what a pose with a centred principal point misses of a cropped picture
 _KEEP_BEST = 3  # focals that are refined further
 

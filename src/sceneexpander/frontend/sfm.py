@@ -59,7 +59,6 @@ _NEARBY = (1.0, 0.75, 1.33)  # focals to begin from, as factors of one that anot
 _NOTHING_SHARED = "no other photo shares enough with it"
 Judge = Callable[[SparseReconstruction], float]
 
-_MIN_COMMON = 8  # points two views must share before their matches are worth finding again
 
 _log = logging.getLogger(__name__)
 
