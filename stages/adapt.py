@@ -86,7 +86,7 @@ def main(cell: Cell) -> None:
     with progress_bar(f"refine {cell.scene} round {cell.round}", sections.refine.steps) as bar:
         reconstruction, fit = refined(
             reconstruction,
-            state.views,
+            state.toned_views,
             sections.refine,
             doubt_generated=sections.adapt.trust,
             seed=sections.seed,
@@ -99,6 +99,7 @@ def main(cell: Cell) -> None:
         reconstruction.save(folder / "reconstruction")
         if fit is not None:
             write_json_atomic(folder / layout.REFINEMENT, fit)
+        write_json_atomic(folder / "corrections.json", result.corrections)
         if verdict is not None:
             write_json_atomic(folder / "acceptance.json", verdict)
         write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])

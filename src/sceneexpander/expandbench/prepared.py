@@ -22,8 +22,9 @@ from sceneexpander.expandbench.scenes import BenchScene
 from sceneexpander.expansion import LoadedModel, RoundInputs, captured_prediction, initial_state, refined
 from sceneexpander.expansion.rounds import reconstruct, views_priors
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.geometry.gauge import in_gauge_of
 from sceneexpander.geometry.priors import Priors
-from sceneexpander.geometry.similarity import align_poses
+from sceneexpander.geometry.similarity import align_views
 from sceneexpander.optimisation.refine import RefineConfig
 
 SEED = 0  # of the front-end and the warm-up: the same pre-insertion scene for every row and seed
@@ -91,7 +92,8 @@ def prepare_case(
     if not folder.exists():
         views = prepared.state.views.append(view)
         known = _intended_cameras(scene, prepared) if grade.told else None
-        priors, _ = views_priors(views, loaded, frontend, seed=SEED, known=known)
+        estimated, _ = views_priors(views, loaded, frontend, seed=SEED, known=known)
+        priors = in_gauge_of(prepared.state.priors, estimated)
         backbone = reconstruct(views, priors, loaded, prepared.state.weights, method="backbone")
         backbone, _ = refined(backbone, views, refine, doubt_generated=False, seed=SEED)
         with directory_being_written(folder) as scratch:
@@ -131,17 +133,16 @@ def place_in(
 ) -> Float[Tensor, "view 4 4"]:
     """True camera poses where they stand in a reconstruction's own frame and scale: aligned on the captured views.
 
-    Orientations and centres of the captured cameras give the frame, the median ratio of their depths the scale.
+    Orientations and centres of the captured cameras that were estimated give the frame, the median ratio of their depths the scale.
     """
-    true_poses, ratios = [], []
-    captured = len(scene.captured)
-    for index, record in enumerate(scene.captured.records):
-        truth = scene.captured_truth[record.sha256]
-        true_poses.append(truth.world_from_cam)
-        if truth.depth is not None:
-            depth = truth.depth[1::2, 1::2]
-            ratios.append((reconstruction.depth[index] / depth)[depth > 0])
-    scale = float(torch.cat(ratios).median())
-    estimated = reconstruction.world_from_cam[:captured].double()
-    similarity = align_poses(torch.stack(true_poses), estimated, scale=scale)
+    truth = [scene.captured_truth[record.sha256] for record in scene.captured.records]
+    depths = [torch.zeros_like(reconstruction.depth[0]) if t.depth is None else t.depth[1::2, 1::2] for t in truth]
+    captured = len(truth)
+    similarity = align_views(
+        torch.stack([t.world_from_cam for t in truth]),
+        torch.stack(depths),
+        reconstruction.world_from_cam[:captured].double(),
+        reconstruction.depth[:captured],
+        posed=reconstruction.posed[:captured],
+    )
     return similarity.poses(world_from_cam.double()).float()

@@ -173,7 +173,7 @@ class _Worker:
             inputs, weights, seconds, steps = self._adapted(grade, case, config, seed)
             started = time.perf_counter()
             state, reconstruction = finished_round(inputs, weights, self.loaded, config, seed=seed)
-            reconstruction = self._refined(reconstruction, state.views, config, seed)
+            reconstruction = self._refined(reconstruction, state.toned_views, config, seed)
             seconds += time.perf_counter() - started
             before = inputs.state
             without = reconstruct(before.views, before.priors, self.loaded, state.weights, method="alone")
