@@ -64,7 +64,7 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
     state, _, _, _ = initial_state(scene, loaded, config.frontend, config.warmup, seed=config.seed)
     anchors, captured = captured_prediction(state, loaded)
     inserted: InsertedView
-    inserted, _ = generate_inserted_view(scene, 1, state.views, folder, config.generator, seed=config.seed)
+    inserted, _ = generate_inserted_view(scene, 1, state.views, folder, config.generator)
     priors, backbone, _ = joint_reconstruction(state, inserted, loaded, config.frontend, seed=config.seed)
     inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
     views = state.views.append(inserted.view)

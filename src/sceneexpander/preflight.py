@@ -50,7 +50,7 @@ def check_scene(
     count = len(scene.rounds) if rounds is None else rounds
     records = [*scene.views.records]
     for number in range(1, count + 1):
-        inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
+        inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator)
         records += inserted.view.records
     check_truth(folder, records)  # read by the last stages only, so a mistake in it would cost the whole run
     check_weights(config.model)

@@ -62,8 +62,8 @@ class Realign(StrEnum):
 class Spend(StrEnum):
     """When the steps of Algorithm 1 are run: always (the paper), or only where they have something to repair.
 
-    ``where_moved``: where the estimate that the round goes on with has other geometry for the captured views than the one before the
-    insertion, see `sceneexpander.adaptation.acceptance.captured_moved`.
+    ``where_moved``: where the unadapted model gives the captured views another depth beside the inserted view than without it, see
+    `sceneexpander.adaptation.acceptance.captured_moved`.
     """
 
     ALWAYS = "always"

@@ -239,8 +239,7 @@ def correct_round(
 def aligned(inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig, *, seed: int) -> RoundInputs:
     """What the adaptation takes instead of the given estimate and picture: `realigned_priors`, and the photos' tone (`match_tone`)."""
     priors, corrections = realigned_priors(inputs, loaded, config.realign, seed=seed)
-    moved = captured_moved(inputs.state.priors, priors)
-    inputs = replace(inputs, joint_priors=priors, corrections=replace(corrections, captured_moved=moved))
+    inputs = replace(inputs, joint_priors=priors, corrections=corrections)
     return toned(inputs, loaded) if config.tone else inputs
 
 
@@ -284,8 +283,7 @@ def adapted_weights(
 ) -> tuple[WeightsChange, AdaptationResult]:
     """Algorithm 1 alone, on inputs as `aligned` leaves them; without a step where `Spend` does not want any."""
     state = inputs.state
-    if not worth_adapting(inputs, config):
-        _log.info("the insertion left the captured geometry as it was: no steps")
+    if config.steps and not worth_adapting(inputs, loaded, config):
         config = replace(config, steps=0)
     loaded.apply(state.weights)
     result = adapt(
@@ -308,12 +306,20 @@ def adapted_weights(
     return (WeightsChange.between(loaded.base, result.student) if config.steps else state.weights), result
 
 
-def worth_adapting(inputs: RoundInputs, config: AdaptConfig) -> bool:
-    """Whether the round runs its steps, see `Spend`. Where nothing is known of the geometry before, it does."""
+def worth_adapting(inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig) -> bool:
+    """Whether the round runs its steps, see `Spend`: told by what the weights it starts from make of all views."""
     if config.spend is Spend.ALWAYS:
         return True
-    moved = captured_moved(inputs.state.priors, inputs.joint_priors)
-    return moved is None or moved > config.spend_above
+    seen = predict(inputs.views, inputs.joint_priors, loaded, inputs.state.weights)
+    if seen.depth is None:
+        raise ValueError("the anchors are compared with the depth head")
+    count, posed = len(inputs.state.views), inputs.joint_priors.posed
+    moved = captured_moved(inputs.anchors, seen.depth[:count].cpu(), None if posed is None else posed[:count])
+    worth = moved > config.spend_above
+    _log.info(
+        "the insertion moves the captured depth by %.2f %%: %s", 100 * moved, "steps" if worth else "nothing to repair"
+    )
+    return worth
 
 
 def finished_round(
