@@ -44,6 +44,27 @@ def test_the_objective_is_the_weighted_sum_of_both_losses(anchor: float, gen: fl
     )
 
 
+def test_gaussians_join_the_anchors_with_a_weight_of_their_own() -> None:
+    config = AdaptConfig(lambda_anchor=2.0, alpha_gaussian=0.5)
+    draw = torch.Generator().manual_seed(5)
+    made, held = torch.rand(4, H, W, 4, generator=draw), torch.rand(VIEWS, H, W, 4, generator=draw)
+    batch = Batch(captured=(0, 2, 3), inserted=True)
+    student, anchors = replace(geometry(0, 4), splats=made), replace(geometry(1), splats=held)
+    targets = anchor_targets(anchors, batch, [None] * 3, student, config)
+    found = step_losses(student, targets, geometry(2, 1), config)
+    off = (made[:3] - held[[0, 2, 3]]).abs()
+    expected = 0.5 * float(off[..., 0].mean((1, 2)).sum() + off[..., 1:].mean((1, 2, 3)).sum())
+    assert float(found.anchor_gaussian) == pytest.approx(expected, rel=1e-5)
+    without = step_losses(replace(student, splats=None), targets, geometry(2, 1), config)
+    assert float(found.objective - without.objective) == pytest.approx(2 * expected, rel=1e-4)
+    grids = [draw_warp(WARPED, H, W, draw), None, None]
+    moved = anchor_targets(anchors, batch, grids, student, replace(config, warp_targets=True))
+    assert moved.splats is not None
+    assert grids[0] is not None
+    torch.testing.assert_close(moved.splats[0].movedim(-1, 0), warp_maps(held[0].movedim(-1, 0), grids[0]))
+    assert torch.equal(moved.splats[1], held[2])
+
+
 def test_without_the_inserted_view_there_is_no_self_distillation() -> None:
     config = AdaptConfig(lambda_anchor=2.0, lambda_gen=3.0)
     student, anchors = geometry(0, 3), geometry(1, 3)
