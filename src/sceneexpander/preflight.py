@@ -18,6 +18,8 @@ from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
 from sceneexpander.models.weights import HUB_ID
 
+CHECKED_SECTIONS = ("seed", "scene", "generator", "model", "rivals")  # of the configuration, beside the device
+
 
 def check_scene(
     name: str,
@@ -27,6 +29,7 @@ def check_scene(
     overrides: Sequence[str],
     rounds: int | None = None,
     methods: Sequence[str] = (),
+    device: bool = True,
 ) -> int:
     """Compose the configuration for a scene and read all of its pictures; nothing is written.
 
@@ -37,6 +40,7 @@ def check_scene(
         overrides: Hydra overrides.
         rounds: how many rounds are to run; None: all that the scene defines.
         methods: that are to run; reconstructors of others among them that have no weights will say so in their rows.
+        device: whether the device must be there; not on a machine that only hands jobs to others.
 
     Returns:
         the number of rounds.
@@ -45,7 +49,8 @@ def check_scene(
         UserError: one line about the first problem found.
     """
     config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
-    check_device(config.device)
+    if device:
+        check_device(config.device)
     scene = load_scene(folder, config.scene)
     count = len(scene.rounds) if rounds is None else rounds
     records = [*scene.views.records]
