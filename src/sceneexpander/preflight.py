@@ -12,6 +12,7 @@ from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation import check_truth
+from sceneexpander.evaluation.image import WINDOW
 from sceneexpander.expansion import ModelConfig, load_model
 from sceneexpander.generation import generate_inserted_view
 from sceneexpander.inference.config import RivalsConfig
@@ -52,6 +53,13 @@ def check_scene(
     if device:
         check_device(config.device)
     scene = load_scene(folder, config.scene)
+    if min(scene.views.height, scene.views.width) < WINDOW:
+        size = f"{scene.views.width} x {scene.views.height}"
+        raise UserError(
+            f"makes pictures of {size} pixels, fewer than {WINDOW} x {WINDOW}",
+            where="scene.long_side_px",
+            fix="raise it, or use photos that are less narrow",
+        )
     count = len(scene.rounds) if rounds is None else rounds
     records = [*scene.views.records]
     for number in range(1, count + 1):

@@ -48,10 +48,10 @@ class Job:
         scene = () if self.scene is None else (f"{SCENE_KEY}={self.scene}",)
         return " ".join((*scene, *self.overrides)) or "default"
 
-    def selection(self, base: Selection) -> Selection:
+    def selection(self, base: Selection, project: Path) -> Selection:
         """What the job runs, where the project itself would run ``base``."""
         scenes = base.scenes if self.scene is None else (self.scene,)
-        return replace(base, scenes=scenes, overrides=merged_overrides(base.overrides, self.overrides))
+        return replace(base, scenes=scenes, overrides=merged_overrides(base.overrides, self.overrides, project=project))
 
 
 def run_job(folder: Path, job: Job, project: Path, *, sweep: str | None = None) -> None:
@@ -60,7 +60,7 @@ def run_job(folder: Path, job: Job, project: Path, *, sweep: str | None = None) 
     Raises:
         RuntimeError: the pipeline failed. (Not SystemExit: that would end the whole sweep.)
     """
-    selection = job.selection(read_selection(project))
+    selection = job.selection(read_selection(project), project)
     try:
         _check(selection, project)
         workspace = make_workspace(folder / "workspace", selection, project=project)
@@ -137,7 +137,7 @@ def check_axes(arguments: Sequence[str], project: Path) -> Axes:
     jobs = [Job(scene=names[0] if names else None, overrides=overrides) for overrides in dict.fromkeys(settings)]
     jobs += [replace(jobs[0], scene=name) for name in names[1:]]
     for job in jobs:
-        selection = job.selection(base)
+        selection = job.selection(base, project)
         for scene in selection.scenes:
             compose(project / "conf", [f"scene={scene_option(project / 'conf', scene)}", *selection.overrides])
     swept = [f"{_HYDRA_SCENE_KEY}={','.join(names)}"] if names else []
@@ -153,7 +153,7 @@ def check_inputs(jobs: Sequence[Job], project: Path) -> None:
     base = read_selection(project)
     seen = set()
     for job in jobs:
-        selection = job.selection(base)
+        selection = job.selection(base, project)
         for scene in selection.scenes:
             composed = compose(
                 project / "conf", [f"scene={scene_option(project / 'conf', scene)}", *selection.overrides]

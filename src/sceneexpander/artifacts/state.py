@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.store import (
     FACTS_NAME,
     RERUN,
@@ -104,12 +105,15 @@ class ExpansionState:
     views: ViewSet
     priors: Priors
     weights: WeightsChange
+    known: KnownCameras | None = None  # of the first views: the captured ones
 
     def save(self, folder: Path) -> None:
         """Write into a (scratch) folder."""
         self.views.save(folder / "views")
         save_priors(folder / "priors", self.priors)
         self.weights.save(folder / "weights")
+        if self.known is not None:
+            self.known.save(folder / "known")
 
     @classmethod
     def load(cls, folder: Path) -> ExpansionState:
@@ -118,4 +122,5 @@ class ExpansionState:
             views=ViewSet.load(folder / "views"),
             priors=load_priors(folder / "priors"),
             weights=WeightsChange.load(folder / "weights"),
+            known=KnownCameras.load(folder / "known") if (folder / "known").is_dir() else None,
         )

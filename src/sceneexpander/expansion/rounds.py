@@ -28,7 +28,7 @@ from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.expansion.cameras import announce_cameras, report_cameras, straighten_views
 from sceneexpander.expansion.loaded import LoadedModel
-from sceneexpander.expansion.optics import optics_of
+from sceneexpander.expansion.optics import known_of, optics_of
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
 from sceneexpander.geometry.priors import Priors
@@ -59,10 +59,13 @@ def views_priors(
     seed: int,
     known: KnownCameras | None = None,
 ) -> tuple[Priors, SparseReconstruction | None]:
-    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing."""
+    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing.
+
+    ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told.
+    """
     if not loaded.uses_front_end:
         return Priors(), None
-    complete = known is not None and known.world_from_cam is not None
+    known = known_of(views, known)
     if any(
         record.distortion != (0.0, 0.0) for record in views.records
     ):  # straightened before; what is left is nothing to look for
@@ -73,7 +76,7 @@ def views_priors(
         generator=child_generator(seed, "frontend"),
         feature_images=views.detail_images,
         known_intrinsics_px=None if known is None else known.intrinsics_px,
-        known_world_from_cam=known.world_from_cam if complete and known is not None else None,
+        known_world_from_cam=None if known is None else known.world_from_cam,
         names=[record.name for record in views.records],
         optics=optics_of(views),
         valid=views.valid,
@@ -108,7 +111,7 @@ def initial_state(
         on_step=on_step,
     )
     weights = WeightsChange.between(loaded.base, loaded.state())
-    state = ExpansionState(views=views, priors=priors, weights=weights)
+    state = ExpansionState(views=views, priors=priors, weights=weights, known=scene.known)
     return state, reconstruct(state.views, priors, loaded, weights, method="captured"), sparse, report
 
 
@@ -163,7 +166,7 @@ def joint_reconstruction(
 ) -> tuple[Priors, Reconstruction, SparseReconstruction | None]:
     """The baseline: the unadapted model given all views, the inserted one last and treated like any other."""
     views = state.views.append(inserted.view)
-    priors, sparse = views_priors(views, loaded, frontend, seed=seed)
+    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known)
     if sparse is not None:
         announce_cameras(
             report_cameras(views, sparse), strict=False
@@ -278,7 +281,7 @@ def finished_round(
         )
         weights = WeightsChange.between(loaded.base, loaded.state())
     reconstruction = reconstruct(views, joint_priors, loaded, weights, method="sceneexpander")
-    expanded = ExpansionState(views=views, priors=joint_priors, weights=weights)
+    expanded = ExpansionState(views=views, priors=joint_priors, weights=weights, known=inputs.state.known)
     reconstruction = closed(reconstruction, config.close_gaps)
     return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction
 
