@@ -191,7 +191,7 @@ class Run:
         del losses  # and the activations with them
         done = ledger.update(step)
         if not math.isfinite(done.gradient):
-            raise NonFiniteLoss(f"the gradient is not finite at step {step}")
+            raise NonFiniteLoss("the gradient is not finite", step)
         drift = done.drift if config.drift is DriftForm.SUM else done.drift / ledger.adapted
         return StepRecord(
             step=step,

@@ -12,14 +12,19 @@ from torch import Tensor
 from sceneexpander.adaptation.config import AdaptConfig, Gauge
 from sceneexpander.adaptation.losses import LossTerms, ViewGeometry, anchor_loss, generation_loss, splat_distance
 from sceneexpander.adaptation.sampling import Batch
+from sceneexpander.errors import UserError
 from sceneexpander.geometry.gauge import camera_vectors_relative_to, scale_camera_vectors
 from sceneexpander.geometry.lookup import warp_maps
 
 Grid = Float[Tensor, "height width 2"]
 
 
-class NonFiniteLoss(RuntimeError):
-    """A loss term became NaN or infinite; the message names the term and the step."""
+class NonFiniteLoss(UserError):
+    """A loss term or the gradient became NaN or infinite: settings, weights or pictures that the adaptation cannot work with."""
+
+    def __init__(self, what: str, step: int) -> None:
+        fix = "lower adapt.learning_rate or the lambdas, or check the weights"
+        super().__init__(f"{what} at step {step} of the adaptation", where="adapt", fix=fix)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +50,7 @@ class StepLosses:
         numbers = torch.stack([getattr(self, name).detach() for name in names]).tolist()
         for name, number in zip(names, numbers, strict=True):
             if not math.isfinite(number):
-                raise NonFiniteLoss(f"{name} is {number} at step {step}")
+                raise NonFiniteLoss(f"{name} is {number}", step)
         return dict(zip(names, numbers, strict=True))
 
 

@@ -31,7 +31,7 @@ from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.expansion.cameras import announce_cameras, report_cameras, straighten_views
 from sceneexpander.expansion.loaded import LoadedModel
-from sceneexpander.expansion.optics import optics_of
+from sceneexpander.expansion.optics import known_of, optics_of
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
 from sceneexpander.geometry.gauge import in_gauge_of, posed_in_both
@@ -79,10 +79,13 @@ def views_priors(
     seed: int,
     known: KnownCameras | None = None,
 ) -> tuple[Priors, SparseReconstruction | None]:
-    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing."""
+    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing.
+
+    ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told.
+    """
     if not loaded.uses_front_end:
         return Priors(), None
-    complete = known is not None and known.world_from_cam is not None
+    known = known_of(views, known)
     if any(
         record.distortion != (0.0, 0.0) for record in views.records
     ):  # straightened before; what is left is nothing to look for
@@ -93,7 +96,7 @@ def views_priors(
         generator=child_generator(seed, "frontend"),
         feature_images=views.detail_images,
         known_intrinsics_px=None if known is None else known.intrinsics_px,
-        known_world_from_cam=known.world_from_cam if complete and known is not None else None,
+        known_world_from_cam=None if known is None else known.world_from_cam,
         names=[record.name for record in views.records],
         optics=optics_of(views),
         valid=views.valid,
@@ -128,7 +131,7 @@ def initial_state(
         on_step=on_step,
     )
     weights = WeightsChange.between(loaded.base, loaded.state())
-    state = ExpansionState(views=views, priors=priors, weights=weights)
+    state = ExpansionState(views=views, priors=priors, weights=weights, known=scene.known)
     return state, reconstruct(state.views, priors, loaded, weights, method="captured"), sparse, report
 
 
@@ -187,7 +190,7 @@ def joint_reconstruction(
     the state's, so that what was known before can be compared with them; the front-end's own findings are in their own scale.
     """
     views = state.views.append(inserted.view)
-    priors, sparse = views_priors(views, loaded, frontend, seed=seed)
+    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known)
     priors = in_gauge_of(state.priors, priors)
     if sparse is not None:
         announce_cameras(
@@ -345,6 +348,7 @@ def finished_round(
         weights=weights,
         first_weights=state.unadapted,
         toned=_joined(state.toned, inputs.toned),
+        known=state.known,
     )
     reconstruction = closed(reconstruction, config.close_gaps)
     return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction
