@@ -83,7 +83,8 @@ def main(cell: Cell) -> None:
             on_look=on_look,
             looks_folder=live / LOOKS,
         )
-    with progress_bar(f"refine {cell.scene} round {cell.round}", sections.refine.steps) as bar:
+    turns = sections.refine.visits * int(reconstruction.posed.sum())
+    with progress_bar(f"refine {cell.scene} round {cell.round}", turns) as bar:
         reconstruction, fit = refined(
             reconstruction,
             state.views,

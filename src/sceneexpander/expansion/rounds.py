@@ -299,7 +299,7 @@ def refined(
     otherwise it counts like a photo, as for the baseline, which does not know better. Pixels that do not show the place count nothing.
     """
     weights = None
-    if config.steps and doubt_generated and bool(reconstruction.generated.any()):
+    if config.visits and doubt_generated and bool(reconstruction.generated.any()):
         weights = pixel_trust(reconstruction, views.images)
     if views.valid is not None:
         shown = views.valid.to(reconstruction.depth)

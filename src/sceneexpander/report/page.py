@@ -236,9 +236,11 @@ def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
                 f"{warmup['steps']} steps, held-out error {warmup['before']:.4f} to {warmup['after']:.4f}, {outcome}",
             )
         )
-    if config["refine"]["steps"]:
-        steps = config["refine"]["steps"]
-        rows.append(("Gaussians", f"in all rows of this reconstructor fitted to their pictures for {steps} steps"))
+    visits = config["refine"]["visits"]
+    if visits:
+        rows.append(
+            ("Gaussians", f"in all rows of this reconstructor fitted to their pictures, {visits} steps per view")
+        )
     rows.append(
         ("All runs", "make ui opens MLflow with the numbers of this and other runs; its menu Views has the columns")
     )

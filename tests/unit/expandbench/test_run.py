@@ -80,7 +80,7 @@ def test_other_code_or_settings_are_measured_again(tmp_path: Path, measured: lis
     assert len(measured) == 2 * count
     run(PLAN, settings(tmp_path, code="two", warmup=WarmupConfig(steps=1)))
     assert len(measured) == 3 * count
-    run(PLAN, settings(tmp_path, code="two", refine=RefineConfig(steps=1)))
+    run(PLAN, settings(tmp_path, code="two", refine=RefineConfig(visits=1)))
     assert len(measured) == 4 * count
 
 

@@ -169,7 +169,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
             "device": "cpu",
             "model": {"weights": "builtin"},
             "adapt": {"steps": 3},
-            "refine": {"steps": 2},
+            "refine": {"visits": 2},
         },
         overrides=["profile=smoke"],
     )
