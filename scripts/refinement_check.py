@@ -23,7 +23,8 @@ from sceneexpander.evaluation.image import psnr
 from sceneexpander.expansion import initial_state
 from sceneexpander.expansion.loaded import load_model
 from sceneexpander.ingest import load_scene
-from sceneexpander.optimisation.refine import RefineConfig, refine
+from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.optimisation.refine import refine
 from sceneexpander.project import find_project
 from sceneexpander.splatting import render
 

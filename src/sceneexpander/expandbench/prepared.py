@@ -24,7 +24,7 @@ from sceneexpander.expansion.rounds import reconstruct, views_priors
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.similarity import align_poses
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 
 SEED = 0  # of the front-end and the warm-up: the same pre-insertion scene for every row and seed
 

@@ -28,7 +28,7 @@ from sceneexpander.expandbench.scenes import BenchScene, build_scene
 from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model, refined
 from sceneexpander.expansion.rounds import RoundInputs, adapted_weights, aligned, finished_round, reconstruct
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 
 CAPTURED = "captured"  # the pre-insertion scene: the ceiling of preservation
 BASELINE = "baseline"  # the same weights given the inserted view

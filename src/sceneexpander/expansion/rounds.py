@@ -35,7 +35,8 @@ from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.protocol import Prediction
-from sceneexpander.optimisation.refine import RefineConfig, RefineReport, refine
+from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.optimisation.refine import RefineReport, refine
 from sceneexpander.splatting import render
 
 _log = logging.getLogger(__name__)
@@ -197,6 +198,19 @@ def adapt_round(
     return *finished_round(inputs, weights, loaded, config, seed=seed), result
 
 
+def correct_round(
+    inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig, *, seed: int
+) -> tuple[ExpansionState, Reconstruction]:
+    """The round without a step: all that is beyond the paper, with the weights it starts from.
+
+    What `adapt_round` brings more is Algorithm 1's. The reconstruction is of the method ``corrected``.
+    """
+    still = replace(config, steps=0, splat_steps=0)
+    inputs = aligned(inputs, loaded, still, seed=seed)
+    state, reconstruction = finished_round(inputs, inputs.state.weights, loaded, still, seed=seed)
+    return state, replace(reconstruction, method="corrected")
+
+
 def aligned(inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig, *, seed: int) -> RoundInputs:
     """What the adaptation takes instead of the given estimate and picture: `realigned_priors`, and the photos' tone (`match_tone`)."""
     inputs = replace(inputs, joint_priors=realigned_priors(inputs, loaded, config.realign, seed=seed))
@@ -305,6 +319,22 @@ def refined(
         shown = views.valid.to(reconstruction.depth)
         weights = shown if weights is None else weights * shown
     return refine(reconstruction, views.images, config, weights=weights, seed=seed, device=device, on_step=on_step)
+
+
+def refined_round(
+    reconstruction: Reconstruction,
+    state: ExpansionState,
+    adapt: AdaptConfig,
+    config: RefineConfig,
+    *,
+    seed: int,
+    device: torch.device | str = "cpu",
+    on_step: Callable[[int, float], None] | None = None,
+) -> tuple[Reconstruction, RefineReport | None]:
+    """`refined` for the expanded scene of a round: to the pictures that the round worked with, doubting the generated as ``trust`` says."""
+    return refined(
+        reconstruction, state.views, config, doubt_generated=adapt.trust, seed=seed, device=device, on_step=on_step
+    )
 
 
 def judge_round(inputs: RoundInputs) -> Acceptance | None:

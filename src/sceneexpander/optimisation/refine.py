@@ -19,29 +19,12 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.geometry.rigid import rigid_inverse
-from sceneexpander.optimisation.config import RatesConfig
+from sceneexpander.optimisation.config import RatesConfig, RefineConfig
 from sceneexpander.optimisation.optimise import photometric_loss, scene_extent
 from sceneexpander.optimisation.splats import Splats
-from sceneexpander.ranges import Rate, Share, Steps, check_ranges
 from sceneexpander.splatting import rasterise
 
 _LAST_RATE = 0.05  # of the first, reached along a cosine
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RefineConfig:
-    """How long and how fast. Rates are Adam's; that of the means is in units of the scene's extent."""
-
-    visits: Steps = 0  # steps per view: a view more takes nothing from the others; 0: Gaussians stay as made
-    means: Rate = 3.2e-4
-    scales: Rate = 1e-2
-    rotations: Rate = 1e-3
-    opacities: Rate = 0.1
-    colours: Rate = 1e-2
-    ssim_weight: Share = 0.2  # of 1 - SSIM beside the mean absolute error
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

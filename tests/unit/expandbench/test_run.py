@@ -12,7 +12,7 @@ from sceneexpander.expandbench import run as bench
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings, run
 from sceneexpander.expansion import ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 from tests.unit.expandbench.test_table import NUMBERS
 
 PLAN = Plan(

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sceneexpander.expansion.rounds import refined
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 from tests.unit.evaluation.made import own_pictures
 from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
 

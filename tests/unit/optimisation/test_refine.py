@@ -9,8 +9,9 @@ import torch
 
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.image import psnr
+from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.optimisation.optimise import photometric_loss
-from sceneexpander.optimisation.refine import RefineConfig, refine
+from sceneexpander.optimisation.refine import refine
 from sceneexpander.splatting import render
 from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
 
