@@ -82,7 +82,7 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
             state, reconstruction, _ = adapt_round(inputs, loaded, adapt, seed=seed)
             # Fitted to the pictures that the round worked with, and measured on the ones that were given.
             reconstruction, _ = refined(
-                reconstruction, state.views, config.refine, doubt_generated=adapt.trust, seed=seed
+                reconstruction, state.toned_views, config.refine, doubt_generated=adapt.trust, seed=seed
             )
             print(line(f"{row} seed {seed}", reconstruction, views), flush=True)
         made[row] = reconstruction

@@ -100,6 +100,7 @@ def main(cell: Cell) -> None:
         reconstruction.save(folder / "reconstruction")
         if fit is not None:
             write_json_atomic(folder / layout.REFINEMENT, fit)
+        write_json_atomic(folder / "corrections.json", result.corrections)
         if verdict is not None:
             write_json_atomic(folder / "acceptance.json", verdict)
         write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])

@@ -42,12 +42,13 @@ def main(cell: Cell) -> None:
         joint_priors=load_priors(layout.joint_priors(cell.scene, cell.round)),
     )
     loaded = load_model(sections.model, sections.device)
-    state, reconstruction = correct_round(inputs, loaded, sections.adapt, seed=sections.seed)[:2]
+    state, reconstruction, corrections = correct_round(inputs, loaded, sections.adapt, seed=sections.seed)
     reconstruction, fit = refined_round(
         reconstruction, state, sections.adapt, sections.refine, seed=sections.seed, device=sections.device
     )
     with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
         reconstruction.save(folder / "reconstruction")
+        write_json_atomic(folder / "corrections.json", corrections)
         if fit is not None:
             write_json_atomic(folder / layout.REFINEMENT, fit)
 

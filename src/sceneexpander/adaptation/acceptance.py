@@ -18,6 +18,7 @@ from sceneexpander.adaptation.consistency import agreement
 from sceneexpander.adaptation.realign import realign
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.gauge import posed_in_both, poses_relative_to
 from sceneexpander.geometry.lookup import project_to_views, sample_at
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
@@ -25,7 +26,7 @@ from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptanceLimits:
-    """Beyond which a candidate is refused. Chosen on expandbench; see the table in the documentation for how well they tell."""
+    """Beyond which a candidate is refused. Set by hand; docs/ablation.md says how well they tell."""
 
     min_overlap: float = 0.05
     max_depth_conflict: float = 0.12
@@ -72,18 +73,26 @@ def judge_candidate(
         raise ValueError("a candidate can only be judged where the front-end has run")
     count = len(images)
     posed = held.posed is None or bool(held.posed[-1])
-    moved = rotation_angle_deg(after[1:count, :3, :3], before[1:, :3, :3]) if count > 1 else torch.zeros(1)
+    both = posed_in_both(captured, joint, count)
     points = unproject_to_world(depth[-1:], intrinsics[-1:], poses[-1:])[0]
-    found = agreement(points, anchors.depth, poses[:count], intrinsics[:count])
+    photos = torch.arange(count, device=poses.device)
+    if captured.posed is not None and bool(captured.posed.any()):
+        photos = photos[captured.posed]
+    found = agreement(points, anchors.depth[photos], poses[photos], intrinsics[photos])
     overlap = float(found.seen.float().mean())
     depth_conflict = float(found.conflict[found.seen].abs().median()) if posed and bool(found.seen.any()) else None
-    colour_conflict = _colour_conflict(depth[-1], poses, intrinsics, images, inserted, found.seen) if posed else None
+    one = torch.cat([photos, photos.new_tensor([len(poses) - 1])])
+    colour_conflict = (
+        _colour_conflict(depth[-1], poses[one], intrinsics[one], images[photos], inserted, found.seen)
+        if posed
+        else None
+    )
     measured = Acceptance(
         posed=posed,
         overlap=overlap,
         depth_conflict=depth_conflict,
         colour_conflict=colour_conflict,
-        cameras_moved_deg=float(moved.max()),
+        cameras_moved_deg=_turned_deg(before[both], after[:count][both]),
         reasons=(),
     )
     return Acceptance(
@@ -94,6 +103,35 @@ def judge_candidate(
         cameras_moved_deg=measured.cameras_moved_deg,
         reasons=tuple(_reasons(measured, limits)),
     )
+
+
+@torch.no_grad()
+def captured_moved(captured: Priors, joint: Priors) -> float | None:
+    """How far the insertion moved the captured views' geometry: mean |log ratio| of their depths, in one scale.
+
+    This is what Algorithm 1 can repair: its anchors are the geometry before the insertion. None where the front-end has not run.
+
+    Args:
+        captured: of the captured views before the insertion.
+        joint: of the same views and the inserted one, as the round goes on with them, in the same gauge.
+    """
+    if captured.depth is None or joint.depth is None:
+        return None
+    count = len(captured.depth)
+    both = posed_in_both(captured, joint, count)
+    if not bool(both.any()):
+        both = torch.ones_like(both)
+    before, after = captured.depth[both], joint.depth[:count][both]
+    known = (before > 0) & (after > 0)
+    return float((after[known] / before[known]).log().abs().mean()) if bool(known.any()) else None
+
+
+def _turned_deg(before: Tensor, after: Tensor) -> float:
+    """Largest turn of a camera against the first of them; of fewer than two nothing is known."""
+    if len(before) < 2:
+        return 0.0
+    was, now = poses_relative_to(before, 0), poses_relative_to(after, 0)
+    return float(rotation_angle_deg(now[:, :3, :3], was[:, :3, :3]).max())
 
 
 def _colour_conflict(

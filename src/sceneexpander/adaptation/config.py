@@ -59,6 +59,17 @@ class Realign(StrEnum):
     CHOOSE = "choose"
 
 
+class Spend(StrEnum):
+    """When the steps of Algorithm 1 are run: always (the paper), or only where they have something to repair.
+
+    ``where_moved``: where the estimate that the round goes on with has other geometry for the captured views than the one before the
+    insertion, see `sceneexpander.adaptation.acceptance.captured_moved`.
+    """
+
+    ALWAYS = "always"
+    WHERE_MOVED = "where_moved"
+
+
 class Precision(StrEnum):
     """Precision of forward passes; weights, EMA and optimiser state are always float32."""
 
@@ -163,6 +174,9 @@ class AdaptConfig:
     splat_learning_rate: LearningRate = 3e-3
     splat_others: Weight = 0.5  # weight of the same photos without the view's own Gaussians
     inserted_weights: InsertedWeights = InsertedWeights.UNIFORM
+    spend: Spend = Spend.ALWAYS
+    # with spend=where_moved: least mean change of the captured views' log depth by the insertion that is worth the steps
+    spend_above: Annotated[float, Range(0, 10)] = 0.02
     realign: Realign = Realign.NONE
     # bring the inserted picture to the photos' exposure and white balance, see `sceneexpander.adaptation.tone`
     tone: bool = False

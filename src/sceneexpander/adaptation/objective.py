@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.adaptation.augmentation import sample
 from sceneexpander.adaptation.config import AdaptConfig, Gauge
 from sceneexpander.adaptation.losses import LossTerms, ViewGeometry, anchor_loss, generation_loss
 from sceneexpander.adaptation.sampling import Batch
 from sceneexpander.geometry.gauge import camera_vectors_relative_to, scale_camera_vectors
+from sceneexpander.geometry.lookup import warp_maps
 
 Grid = Float[Tensor, "height width 2"]
 
@@ -106,7 +106,7 @@ def _warp_maps(depth: Tensor, normals: Tensor, grids: list[Grid | None]) -> tupl
             moved_depth.append(depth[view])
             moved_normals.append(normals[view])
             continue
-        maps = sample(torch.cat([depth[view][None], normals[view].permute(2, 0, 1)]), grid)
+        maps = warp_maps(torch.cat([depth[view][None], normals[view].permute(2, 0, 1)]), grid)
         moved_depth.append(maps[0])
         moved_normals.append(torch.nn.functional.normalize(maps[1:].permute(1, 2, 0), dim=-1))
     return torch.stack(moved_depth), torch.stack(moved_normals)

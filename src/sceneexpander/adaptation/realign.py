@@ -17,10 +17,11 @@ from torch import Tensor
 from sceneexpander.adaptation.config import Realign
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.gauge import posed_in_both
 from sceneexpander.geometry.lookup import grid_of_pixels, sample_at
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg, transform_points
-from sceneexpander.geometry.similarity import align_poses
+from sceneexpander.geometry.similarity import align_views
 
 _POINTS = 6000
 _BLURS_PX = (6.0, 3.0, 1.5)  # coarse to fine
@@ -84,14 +85,16 @@ def _parts(priors: Priors) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _held(captured: Priors, joint: Priors) -> Priors:
-    """The captured views' priors followed by the inserted view's, brought into their frame and scale."""
+    """The captured views' priors followed by the inserted view's, brought into their frame and scale.
+
+    Placeholders of cameras take no part in that; if no captured view has a camera on both sides, all do.
+    """
     poses, intrinsics, depth = _parts(captured)
     joint_poses, joint_intrinsics, joint_depth = _parts(joint)
     count = len(poses)
-    known = (depth > 0) & (joint_depth[:count] > 0)
-    scale = float((depth / joint_depth[:count])[known].median())
-    similarity = align_poses(joint_poses[:count], poses, scale=scale)
-    last_depth = joint_depth[count:] * scale
+    both = posed_in_both(captured, joint, count)
+    similarity = align_views(joint_poses[:count], joint_depth[:count], poses, depth, posed=both)
+    last_depth = joint_depth[count:] * similarity.scale
     return replace(
         captured,
         world_from_cam=torch.cat([poses, similarity.poses(joint_poses[count:])]),
@@ -116,8 +119,11 @@ def _refined(
     """Direct image alignment of the inserted camera with the captured points, then the scale of its depth."""
     poses, intrinsics, depth = _parts(held)
     count = len(images)
-    points = unproject_to_world(anchors.depth, intrinsics[:count], poses[:count]).reshape(-1, 3)
-    colours = images.movedim(1, -1).reshape(-1, 3)
+    seen = torch.arange(count, device=poses.device)
+    if held.posed is not None and bool(held.posed[:count].any()):
+        seen = seen[held.posed[:count]]  # where the points of a placeholder are means nothing
+    points = unproject_to_world(anchors.depth[seen], intrinsics[seen], poses[seen]).reshape(-1, 3)
+    colours = images[seen].movedim(1, -1).reshape(-1, 3)
     chosen = torch.randperm(len(points), generator=generator)[: 4 * _POINTS].to(points.device)
     points, colours = points[chosen], colours[chosen]
     visible = _in_frame(points, poses[-1], intrinsics[-1], depth[-1])

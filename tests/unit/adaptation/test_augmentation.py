@@ -4,13 +4,13 @@ import torch
 from sceneexpander.adaptation.augmentation import (
     Mode,
     _block_weights,
-    augment_view,
     draw_mode,
+    draw_warp,
     identity_grid,
-    sample,
     warp_grid,
 )
 from sceneexpander.adaptation.config import AugmentConfig
+from sceneexpander.geometry.lookup import warp_maps
 
 STILL = AugmentConfig(rotation_deg=0, translation=0, scale=0, shear_deg=0)
 
@@ -27,15 +27,12 @@ def test_zero_magnitudes_change_nothing(mode: Mode) -> None:
 
 def test_the_identity_grid_samples_every_pixel_at_its_centre() -> None:
     image = torch.rand(3, 17, 23, generator=_generator())
-    torch.testing.assert_close(sample(image, identity_grid(17, 23)), image, atol=1e-5, rtol=0)
+    torch.testing.assert_close(warp_maps(image, identity_grid(17, 23)), image, atol=1e-5, rtol=0)
 
 
-def test_identity_mode_returns_the_very_same_tensor() -> None:
-    image = torch.rand(3, 8, 8)
+def test_identity_mode_has_no_warp() -> None:
     config = AugmentConfig(identity=1, global_affine=0, blockwise=0, global_and_block=0)
-    moved, grid = augment_view(image, config, _generator())
-    assert moved is image
-    assert grid is None
+    assert draw_warp(config, 8, 8, _generator()) is None
 
 
 def test_modes_come_with_their_probabilities() -> None:

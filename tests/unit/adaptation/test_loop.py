@@ -139,7 +139,6 @@ def test_a_resumed_run_gives_the_bits_of_an_unbroken_one(tmp_path: Path, stop_af
     )
     unbroken = _run(inputs=inputs)
     assert _bits(resumed) == _bits(unbroken)
-    assert sha256_of_tensors(resumed.teacher) == sha256_of_tensors(unbroken.teacher)
     assert resumed.records == unbroken.records
     assert steps == list(range(1, FAST.steps + 1))
 

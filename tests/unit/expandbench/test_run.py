@@ -28,7 +28,9 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     """The cells that were really measured; measuring itself is replaced, the cache is not."""
     calls: list[tuple[str, ...]] = []
 
-    def fake(self: bench._Worker, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult:
+    def fake(
+        self: bench._Worker, grade: str, row: str, seed: int, config: AdaptConfig | None, checkpoints: Path
+    ) -> CellResult:
         calls.append((self.name, grade, row, str(seed)))
         alone = None if config is None else NUMBERS
         return CellResult(
@@ -48,7 +50,7 @@ def settings(folder: Path, **changes: object) -> Settings:
 def test_every_cell_once(tmp_path: Path, measured: list[tuple[str, ...]]) -> None:
     seen: list[CellResult] = []
     cells = run(PLAN, settings(tmp_path), on_cell=seen.append)
-    assert len(cells) == len(PLAN) == len(measured) == 2 * (1 + 2 * (1 + 4))
+    assert len(cells) == len(PLAN) == len(measured) == 2 * 2 * (1 + 2 * (1 + 2))
     assert seen == cells
     assert {cell.row for cell in cells} == {CAPTURED, BASELINE, "full", "anchor"}
     again = run(PLAN, settings(tmp_path))
