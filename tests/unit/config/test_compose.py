@@ -114,7 +114,7 @@ def test_the_controls_take_away_what_they_say() -> None:
     assert (without.insertion_probability, without.lambda_gen) == (0, 0)
     assert without.steps == full.steps > 0
     assert typed(composed("ablation=control_no_anchor")).adapt.lambda_anchor == 0 < full.lambda_anchor
-    only = typed(composed("ablation=control_no_adaptation")).adapt
+    only = typed(composed("ablation=corrected")).adapt
     assert replace(only, steps=full.steps) == full
     assert only.steps == 0
 
