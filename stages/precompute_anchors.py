@@ -9,7 +9,7 @@ from sceneexpander.artifacts.state import ExpansionState
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import ModelConfig, captured_prediction, load_model, refined
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 from stages import layout
 from stages.runner import Cell, stage, use_threads
 

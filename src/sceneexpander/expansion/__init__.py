@@ -11,6 +11,7 @@ from sceneexpander.expansion.rounds import (
     joint_reconstruction,
     judge_round,
     refined,
+    refined_round,
 )
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "judge_round",
     "load_model",
     "refined",
+    "refined_round",
     "report_cameras",
     "straighten_views",
 ]

@@ -39,7 +39,8 @@ from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.protocol import Prediction
-from sceneexpander.optimisation.refine import RefineConfig, RefineReport, refine
+from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.optimisation.refine import RefineReport, refine
 from sceneexpander.splatting import render
 
 _log = logging.getLogger(__name__)
@@ -376,12 +377,34 @@ def refined(
     otherwise it counts like a photo, as for the baseline, which does not know better. Pixels that do not show the place count nothing.
     """
     weights = None
-    if config.steps and doubt_generated and bool(reconstruction.generated.any()):
+    if config.visits and doubt_generated and bool(reconstruction.generated.any()):
         weights = pixel_trust(reconstruction, views.images)
     if views.valid is not None:
         shown = views.valid.to(reconstruction.depth)
         weights = shown if weights is None else weights * shown
     return refine(reconstruction, views.images, config, weights=weights, seed=seed, device=device, on_step=on_step)
+
+
+def refined_round(
+    reconstruction: Reconstruction,
+    state: ExpansionState,
+    adapt: AdaptConfig,
+    config: RefineConfig,
+    *,
+    seed: int,
+    device: torch.device | str = "cpu",
+    on_step: Callable[[int, float], None] | None = None,
+) -> tuple[Reconstruction, RefineReport | None]:
+    """`refined` for the expanded scene of a round: to the pictures that the round worked with, doubting the generated as ``trust`` says."""
+    return refined(
+        reconstruction,
+        state.toned_views,
+        config,
+        doubt_generated=adapt.trust,
+        seed=seed,
+        device=device,
+        on_step=on_step,
+    )
 
 
 def judge_round(inputs: RoundInputs) -> Acceptance | None:

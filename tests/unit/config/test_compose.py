@@ -114,7 +114,7 @@ def test_the_papers_method_runs_all_its_steps_and_nothing_beyond(model: str) -> 
     chosen = typed(composed("method=paper", f"model={model}", *NEEDED.get(f"model={model}", []), "profile=gpu"))
     rate = typed(composed("ablation=full")).adapt.learning_rate if model == "mini" else 1e-5
     assert chosen.adapt == replace(AdaptConfig(), learning_rate=rate)
-    assert chosen.refine.steps == 0
+    assert chosen.refine.visits == 0
     assert typed(composed("method=paper")).adapt == typed(composed("ablation=full")).adapt
 
 
@@ -124,7 +124,7 @@ def test_the_controls_take_away_what_they_say() -> None:
     assert (without.insertion_probability, without.lambda_gen) == (0, 0)
     assert without.steps == full.steps > 0
     assert typed(composed("ablation=control_no_anchor")).adapt.lambda_anchor == 0 < full.lambda_anchor
-    only = typed(composed("ablation=control_no_adaptation")).adapt
+    only = typed(composed("ablation=corrected")).adapt
     assert replace(only, steps=full.steps) == full
     assert only.steps == 0
 

@@ -30,7 +30,7 @@ from sceneexpander.expansion.rounds import aligned, realigned_priors, reconstruc
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.gaussians import rgb_from_sh
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.synthetic import make_views
 from tests.support.gauged_model import GaugedReconstructor
 from tests.unit.expansion.test_choose import view_set
@@ -265,7 +265,7 @@ def test_a_baseline_treats_the_inserted_view_like_any_other(
 
     monkeypatch.setattr(rounds_module, "refine", spy)
     for doubt in (False, True):
-        refined(made, inputs.views, RefineConfig(steps=1), doubt_generated=doubt, seed=0)
+        refined(made, inputs.views, RefineConfig(visits=1), doubt_generated=doubt, seed=0)
     assert told[0] is None, "every pixel of every picture counts"
     assert told[1] is not None
     assert bool((told[1][:VIEWS] == 1).all()), "photos are never doubted"
