@@ -24,6 +24,7 @@ from sceneexpander.expansion import (
     joint_reconstruction,
     judge_round,
     refined,
+    refined_round,
 )
 from sceneexpander.expansion import rounds as rounds_module
 from sceneexpander.expansion.rounds import aligned, realigned_priors, reconstruct
@@ -361,3 +362,25 @@ def test_a_placeholder_hardly_moves_the_inserted_camera(truth: tuple[torch.Tenso
     assert verdict.cameras_moved_deg < 0.01
     assert verdict.depth_conflict is not None
     assert verdict.depth_conflict < 0.02
+
+
+@pytest.mark.parametrize("trust", [False, True])
+def test_the_fit_of_a_round_sees_what_the_round_worked_with(
+    truth: tuple[torch.Tensor, Priors], monkeypatch: pytest.MonkeyPatch, trust: bool
+) -> None:
+    loaded = loaded_model()
+    config = replace(STILL, tone=True, trust=trust)
+    state, made, _ = adapt_round(start(truth, loaded, paint=True), loaded, config, seed=0)
+    told: list[tuple[torch.Tensor, torch.Tensor | None]] = []
+
+    def spy(start: Reconstruction, images: torch.Tensor, config: RefineConfig, **more: torch.Tensor | None) -> object:
+        told.append((images, more["weights"]))
+        return start, None
+
+    monkeypatch.setattr(rounds_module, "refine", spy)
+    refined_round(made, state, config, RefineConfig(visits=1), seed=0)
+    images, weights = told[0]
+    assert torch.equal(images, state.toned_views.images)
+    assert not torch.equal(images, state.views.images)
+    assert (weights is not None) == trust
+    assert weights is None or float(weights[VIEWS][PAINTED].mean()) < 0.5
