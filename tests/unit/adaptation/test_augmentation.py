@@ -86,3 +86,16 @@ def test_rotation_is_a_rotation_for_any_aspect() -> None:
 def test_probabilities_must_sum_to_one() -> None:
     with pytest.raises(ValueError, match="sum to 1"):
         AugmentConfig(identity=0.5)
+
+
+def test_blocks_move_as_strongly_as_configured() -> None:
+    def mean_move(strength: float) -> float:
+        config = AugmentConfig(block_strength=strength)
+        moves = [
+            (warp_grid(Mode.BLOCK, config, 60, 80, _generator(seed)) - identity_grid(60, 80)).norm(dim=-1).mean()
+            for seed in range(5)
+        ]
+        return float(torch.stack(moves).mean())
+
+    assert mean_move(1.0) == pytest.approx(2 * mean_move(0.5), rel=0.1)
+    assert mean_move(0.0) < 1e-6
