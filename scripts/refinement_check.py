@@ -23,7 +23,8 @@ from sceneexpander.evaluation.image import psnr
 from sceneexpander.expansion import initial_state
 from sceneexpander.expansion.loaded import load_model
 from sceneexpander.ingest import load_scene
-from sceneexpander.optimisation.refine import RefineConfig, refine
+from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.optimisation.refine import refine
 from sceneexpander.project import find_project
 from sceneexpander.splatting import render
 
@@ -44,14 +45,14 @@ def check(folder: Path, overrides: list[str]) -> None:
     scene = load_scene(folder, config.scene)
     loaded = load_model(config.model, config.device)
     state, start, _, _ = initial_state(scene, loaded, config.frontend, config.warmup, seed=config.seed)
-    views, steps = state.views, config.refine
+    views, settings = state.views, config.refine
     posed = start.posed.nonzero()[:, 0].tolist()
-    result, _ = refine(start, views.images, steps, seed=config.seed)
+    result, _ = refine(start, views.images, settings, seed=config.seed)
     before, after = (sum(shown(r, views, v) for v in posed) / len(posed) for r in (start, result))
     print(f"{scene.name}: {len(posed)} photos, {len(start.gaussians)} Gaussians, fitted {before:.2f} -> {after:.2f} dB")
     changes = []
     for view in posed:
-        before, after = held_out(start, views, view, steps, seed=config.seed)
+        before, after = held_out(start, views, view, settings, seed=config.seed)
         changes.append(after - before)
         print(f"  without {views.records[view].name}: {before:.2f} -> {after:.2f} dB", flush=True)
     print(f"  held out, mean: {sum(changes) / len(changes):+.2f} dB", flush=True)

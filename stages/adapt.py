@@ -15,8 +15,8 @@ from sceneexpander.artifacts.live import LiveLog
 from sceneexpander.artifacts.state import ExpansionState, load_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, judge_round, load_model, refined
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, judge_round, load_model, refined_round
+from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.progress import progress_bar
 from stages import layout
 from stages.runner import Cell, checkpoint_folder, live_folder, remove_folder, run_identity, stage, use_threads
@@ -83,12 +83,13 @@ def main(cell: Cell) -> None:
             on_look=on_look,
             looks_folder=live / LOOKS,
         )
-    with progress_bar(f"refine {cell.scene} round {cell.round}", sections.refine.steps) as bar:
-        reconstruction, fit = refined(
+    turns = sections.refine.visits * int(reconstruction.posed.sum())
+    with progress_bar(f"refine {cell.scene} round {cell.round}", turns) as bar:
+        reconstruction, fit = refined_round(
             reconstruction,
-            state.views,
+            state,
+            sections.adapt,
             sections.refine,
-            doubt_generated=sections.adapt.trust,
             seed=sections.seed,
             device=sections.device,
             on_step=lambda step, loss: bar.update(step, loss),
@@ -99,6 +100,7 @@ def main(cell: Cell) -> None:
         reconstruction.save(folder / "reconstruction")
         if fit is not None:
             write_json_atomic(folder / layout.REFINEMENT, fit)
+        write_json_atomic(folder / "corrections.json", result.corrections)
         if verdict is not None:
             write_json_atomic(folder / "acceptance.json", verdict)
         write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.inserted import InsertedView
-from sceneexpander.artifacts.metrics import UnavailableRow
+from sceneexpander.artifacts.metrics import Fit, UnavailableRow
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
+from sceneexpander.artifacts.store import read_json
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.files import read_sections
@@ -64,10 +65,22 @@ def main(cell: Cell) -> None:
                 width=renders.width,
             ),
             truth=load_truth(layout.source(cell.scene)),
+            fit=_fit(cell),
         )
         for run in runs
     ]
     over_repeats(rows).save(layout.metrics(cell.scene, cell.round, cell.method))
+
+
+def _fit(cell: Cell) -> Fit:
+    """What was done to the method's Gaussians after they were predicted."""
+    if cell.method in layout.OPTIMISED:
+        return Fit.OPTIMISED
+    found = layout.reconstruction(cell.scene, cell.round, cell.method).parent / layout.REFINEMENT
+    if not found.is_file():
+        return Fit.PREDICTED
+    report = read_json(found)
+    return Fit.FITTED if report["after"] < report["before"] else Fit.PREDICTED
 
 
 if __name__ == "__main__":

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sceneexpander.selection import METHODS, OPTIMISABLE, OURS, RIVALS, SPLATTED
+from sceneexpander.selection import CORRECTED, METHODS, OPTIMISABLE, OPTIMISED, OURS, RIVALS, SPLATTED
 
-__all__ = ["METHODS", "OPTIMISABLE", "OURS", "RIVALS", "SPLATTED"]
+__all__ = ["CORRECTED", "METHODS", "OPTIMISABLE", "OPTIMISED", "OURS", "RIVALS", "SPLATTED"]
 
 SCENES = Path("scenes")
 OUTPUTS = Path("outputs")

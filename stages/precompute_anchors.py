@@ -1,14 +1,15 @@
-"""precompute_anchors: what the model believes before the insertion, once as anchors and once as a reconstruction."""
+"""precompute_anchors: what the model believes before the insertion, as anchors, and the scene as it was then."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import ExpansionState
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import ModelConfig, captured_prediction, load_model, refined
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 from stages import layout
 from stages.runner import Cell, stage, use_threads
 
@@ -31,14 +32,19 @@ def main(cell: Cell) -> None:
     use_threads(sections.threads)
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
     anchors, reconstruction = captured_prediction(state, load_model(sections.model, sections.device))
-    reconstruction, fit = refined(
-        reconstruction,
-        state.views,
-        sections.refine,
-        doubt_generated=True,
-        seed=sections.seed,
-        device=sections.device,
-    )
+    if cell.previous:
+        # What the scene was before this insertion is what the last round left, not what the model would make of its views now.
+        last = Reconstruction.load(layout.reconstruction(cell.scene, cell.previous, "sceneexpander"))
+        reconstruction, fit = replace(last, method="captured"), None
+    else:
+        reconstruction, fit = refined(
+            reconstruction,
+            state.views,
+            sections.refine,
+            doubt_generated=False,
+            seed=sections.seed,
+            device=sections.device,
+        )
     with directory_being_written(layout.anchors(cell.scene, cell.round)) as folder:
         anchors.save(folder)
     with directory_being_written(layout.reconstruction(cell.scene, cell.round, "captured").parent) as folder:

@@ -10,7 +10,7 @@ from sceneexpander.artifacts.store import directory_being_written, write_json_at
 from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_model, refined, report_cameras
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 from stages import layout
 from stages.runner import Cell, stage, use_threads
 

@@ -19,13 +19,14 @@ import pytest
 import yaml
 from PIL import Image
 
-from sceneexpander.selection import Selection
+from sceneexpander.selection import CORRECTED, OURS, Selection
 from sceneexpander.workspace import make_workspace, workspace_environment
 
 pytestmark = pytest.mark.pipeline
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ("profile=smoke", "frontend.sfm.max_features=800")
+METHODS = (*OURS, CORRECTED)
 ADAPT = ["-m", "stages.adapt", "room", "1", "0"]
 
 
@@ -68,7 +69,7 @@ class Project:
     def __init__(self, folder: Path, overrides: tuple[str, ...] = SMOKE) -> None:
         self.folder = folder
         scene = make_scene(folder.parent / f"{folder.name}-scene")
-        selection = Selection(scenes=("room",), rounds=1, overrides=overrides)
+        selection = Selection(scenes=("room",), rounds=1, methods=METHODS, overrides=overrides)
         make_workspace(folder, selection, project=ROOT, scenes={"room": scene})
         (folder / ".dvc" / "config.local").write_text("[core]\n    no_scm = true\n")
         self.environment = {**workspace_environment(folder, folder), "OMP_NUM_THREADS": "1"}
@@ -100,7 +101,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
     project = Project(tmp_path_factory.mktemp("pipeline") / "project")
     executed = project.repro()
     assert executed[0] == "code"
-    assert len(executed) == 26, executed
+    assert len(executed) == 30, executed
     yield project
     shutil.rmtree(project.folder, ignore_errors=True)
 
@@ -117,15 +118,16 @@ def test_everything_that_was_promised_is_there(finished: Project) -> None:
         f"{kind}_{step:04d}" for step in (0, 4) for kind in ("inserted", "depth")
     ]
     assert "captured views see" in page or "fits badly" in page, "the verdict on the inserted view"
-    assert len(re.findall(r"Gaussians of [^<]* 4 steps", page)) == 3
-    for method in ("captured", "backbone", "sceneexpander"):
+    assert re.findall(r"Gaussians of [^<]* (\d) steps", page) == ["3", "4", "4", "4"], "a visit for every view"
+    for method in METHODS:
         renders = outputs / "room" / "round_1" / "renders" / method
         assert (renders / "rgb.mp4").stat().st_size > 1000
         metrics = json.loads((outputs / "room" / "round_1" / "metrics" / f"{method}.json").read_text())
         assert metrics["model"] == "mini"
         assert 5 < metrics["psnr_db"] < 100
+        assert metrics["fit"] in ("fitted", "as predicted")
     numbers = json.loads((finished.folder / "results" / "metrics.json").read_text())
-    assert set(numbers["room"]["round_1"]) == {"captured", "backbone", "sceneexpander"}
+    assert set(numbers["room"]["round_1"]) == set(METHODS)
     log = json.loads((outputs / "room" / "round_1" / "sceneexpander" / "log.json").read_text())
     assert [record["step"] for record in log] == [1, 2, 3, 4]
 
@@ -149,12 +151,12 @@ def test_a_comment_reruns_no_work_and_code_reruns_what_uses_it(finished: Project
 
 
 def test_tracking_is_complete_and_records_once(finished: Project) -> None:
-    assert finished.runs() == 3
+    assert finished.runs() == len(METHODS)
     shutil.rmtree(finished.folder / "mlflow")
     assert finished.repro() == ["track"], "everything else comes from the cache"
-    assert finished.runs() == 3
+    assert finished.runs() == len(METHODS)
     finished.run("-m", "stages.track")
-    assert finished.runs() == 3
+    assert finished.runs() == len(METHODS)
 
 
 def test_a_setting_reruns_only_what_reads_it(finished: Project) -> None:
@@ -165,20 +167,23 @@ def test_a_setting_reruns_only_what_reads_it(finished: Project) -> None:
         executed = finished.repro()
     finally:
         params.write_text(before)
-    assert executed == [
+    remade = {
+        f"{stage}@room-round0-{method}"
+        for stage in ("render", "pack", "evaluate")
+        for method in ("corrected", "sceneexpander")
+    }
+    assert set(executed) == remade | {
         "resolve@room",
+        "correct@room-round0",
         "adapt@room-round0",
         "optimise@room-round0-sceneexpander",
-        "render@room-round0-sceneexpander",
-        "pack@room-round0-sceneexpander",
-        "evaluate@room-round0-sceneexpander",
         "collect@room",
         "report",
         "track",
-    ]
-    assert finished.runs() == 6
+    }
+    assert finished.runs() == 2 * len(METHODS)
     assert finished.repro() == ["track"], "going back is restored"
-    assert finished.runs() == 6
+    assert finished.runs() == 2 * len(METHODS)
 
 
 def test_a_killed_adaptation_resumes_with_the_same_bits(finished: Project) -> None:
@@ -284,7 +289,7 @@ def test_expand_runs_a_folder_of_photos(finished: Project) -> None:
     page = finished.folder / "runs" / "mine" / "outputs" / "report" / "index.html"
     assert done.stdout.strip().endswith(f"report: {page}")
     assert "A &#34;wall&#34;, further on." in page.read_text()
-    assert finished.runs() == 9, "runs of a workspace are tracked in the project"
+    assert finished.runs() == 3 * len(METHODS), "runs of a workspace are tracked in the project"
 
 
 def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_path: Path) -> None:
@@ -311,7 +316,7 @@ def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_pa
         "pack-sceneexpander",
         "evaluate-sceneexpander",
     }
-    assert fresh == {"adapt"} | made_from_it
+    assert fresh == {"adapt", "correct-corrected"} | made_from_it
 
 
 def test_the_pinned_dvc_still_has_what_the_locks_are_named_by() -> None:
@@ -346,6 +351,8 @@ def test_rivals_are_rows_like_any_other_and_say_so_when_they_cannot_be(finished:
         params.write_text(yaml.safe_dump(changed))
         executed = finished.repro()
         again = finished.repro()
+        rounds = tmp_path / "round_1"
+        shutil.copytree(finished.folder / "outputs" / "room" / "round_1", rounds)
         page = (finished.folder / "outputs" / "report" / "index.html").read_text()
         table = (finished.folder / "outputs" / "report" / "comparison.md").read_text()
         numbers = json.loads((finished.folder / "results" / "metrics.json").read_text())["room"]["round_1"]
@@ -359,8 +366,12 @@ def test_rivals_are_rows_like_any_other_and_say_so_when_they_cannot_be(finished:
     for row in rows[:3]:
         assert 3 < numbers[row]["psnr_db"] < 100
         assert numbers[row]["inserted_psnr_db"] > 3
+    fits = {
+        row: json.loads((rounds / row / "refinement.json").read_text())["steps"] for row in ("backbone", "omnivggt")
+    }
+    assert fits["omnivggt"] == fits["backbone"] == 4, "the same fit as ours: a visit for every view"
     assert numbers["gaussian_splatting"]["gaussians"] <= 3000, "what it started from, thinned, and its growth"
     assert "OmniVGGT, pixel-aligned" in page
     assert "needs the public checkpoint" in page
     assert "Livioni/OmniVGGT" in page, "whose weights they are"
-    assert len([line for line in table.splitlines() if line.startswith("| ")]) == 2 + 7
+    assert len([line for line in table.splitlines() if line.startswith("| ")]) == 2 + 8

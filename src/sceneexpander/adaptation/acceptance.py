@@ -10,14 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.adaptation.config import Realign
 from sceneexpander.adaptation.consistency import agreement
-from sceneexpander.adaptation.realign import realign
+from sceneexpander.adaptation.realign import anchored_depth, realign
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.gauge import posed_in_both, poses_relative_to
 from sceneexpander.geometry.lookup import project_to_views, sample_at
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
@@ -25,7 +26,7 @@ from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptanceLimits:
-    """Beyond which a candidate is refused. Chosen on expandbench; see the table in the documentation for how well they tell."""
+    """Beyond which a candidate is refused. Set by hand; docs/ablation.md says how well they tell."""
 
     min_overlap: float = 0.05
     max_depth_conflict: float = 0.12
@@ -72,18 +73,26 @@ def judge_candidate(
         raise ValueError("a candidate can only be judged where the front-end has run")
     count = len(images)
     posed = held.posed is None or bool(held.posed[-1])
-    moved = rotation_angle_deg(after[1:count, :3, :3], before[1:, :3, :3]) if count > 1 else torch.zeros(1)
+    both = posed_in_both(captured, joint, count)
     points = unproject_to_world(depth[-1:], intrinsics[-1:], poses[-1:])[0]
-    found = agreement(points, anchors.depth, poses[:count], intrinsics[:count])
+    photos = torch.arange(count, device=poses.device)
+    if captured.posed is not None and bool(captured.posed.any()):
+        photos = photos[captured.posed]
+    found = agreement(points, anchored_depth(captured, anchors)[photos], poses[photos], intrinsics[photos])
     overlap = float(found.seen.float().mean())
     depth_conflict = float(found.conflict[found.seen].abs().median()) if posed and bool(found.seen.any()) else None
-    colour_conflict = _colour_conflict(depth[-1], poses, intrinsics, images, inserted, found.seen) if posed else None
+    one = torch.cat([photos, photos.new_tensor([len(poses) - 1])])
+    colour_conflict = (
+        _colour_conflict(depth[-1], poses[one], intrinsics[one], images[photos], inserted, found.seen)
+        if posed
+        else None
+    )
     measured = Acceptance(
         posed=posed,
         overlap=overlap,
         depth_conflict=depth_conflict,
         colour_conflict=colour_conflict,
-        cameras_moved_deg=float(moved.max()),
+        cameras_moved_deg=_turned_deg(before[both], after[:count][both]),
         reasons=(),
     )
     return Acceptance(
@@ -94,6 +103,33 @@ def judge_candidate(
         cameras_moved_deg=measured.cameras_moved_deg,
         reasons=tuple(_reasons(measured, limits)),
     )
+
+
+@torch.no_grad()
+def captured_moved(
+    anchors: Anchors,
+    depth: Float[Tensor, "captured height width"],
+    posed: Bool[Tensor, "captured"] | None = None,
+) -> float:
+    """How far the insertion moves what the model says of the captured views: mean |log ratio| of depth to anchored depth.
+
+    This is what Algorithm 1 can repair, since its anchors are the depth before the insertion.
+
+    Args:
+        anchors: of the captured views.
+        depth: what the unadapted model predicts for them beside the inserted view, in the same gauge.
+        posed: views whose camera is an estimate; the others take no part, unless there is nothing else.
+    """
+    change = (depth / anchors.depth).log().abs().mean((-2, -1))
+    return float((change[posed] if posed is not None and bool(posed.any()) else change).mean())
+
+
+def _turned_deg(before: Tensor, after: Tensor) -> float:
+    """Largest turn of a camera against the first of them; of fewer than two nothing is known."""
+    if len(before) < 2:
+        return 0.0
+    was, now = poses_relative_to(before, 0), poses_relative_to(after, 0)
+    return float(rotation_angle_deg(now[:, :3, :3], was[:, :3, :3]).max())
 
 
 def _colour_conflict(

@@ -7,6 +7,8 @@ A warp is a sampling grid: for every output pixel, where in the input it looks (
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 
 import torch
@@ -14,6 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.adaptation.config import AugmentConfig
+from sceneexpander.geometry.lookup import warp_known, warp_maps
+from sceneexpander.geometry.priors import Priors
 
 
 class Mode(StrEnum):
@@ -124,22 +128,27 @@ def _block_warp(
     return grid + torch.stack([offset_x, offset_y], dim=-1)
 
 
-def sample(
-    maps: Float[Tensor, "channel height width"], grid: Float[Tensor, "height width 2"]
-) -> Float[Tensor, "channel height width"]:
-    """Bilinear sampling of maps at a grid; outside the image the border is repeated."""
-    sampled = torch.nn.functional.grid_sample(
-        maps[None], grid[None].to(maps), mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return sampled[0]
-
-
-def augment_view(
-    image: Float[Tensor, "3 height width"], config: AugmentConfig, generator: torch.Generator
-) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width 2"] | None]:
-    """One randomly perturbed view and its sampling grid; (the very same tensor, None) in identity mode."""
+def draw_warp(
+    config: AugmentConfig, height: int, width: int, generator: torch.Generator
+) -> Float[Tensor, "height width 2"] | None:
+    """The sampling grid of one random perturbation; None in identity mode."""
     mode = draw_mode(config, generator)
-    if mode is Mode.IDENTITY:
-        return image, None
-    grid = warp_grid(mode, config, image.shape[-2], image.shape[-1], generator)
-    return sample(image, grid), grid
+    return None if mode is Mode.IDENTITY else warp_grid(mode, config, height, width, generator)
+
+
+def warp_priors(priors: Priors, grids: Sequence[Float[Tensor, "height width 2"] | None]) -> Priors:
+    """Priors of views whose pictures were warped: depth and evidence move with the pixels, cameras stay.
+
+    One grid per view, the last views may have none. A pixel without a depth stays one, and so does what is blended with it.
+    """
+    depth = None if priors.depth is None else priors.depth.clone()
+    evidence = None if priors.evidence is None else priors.evidence.clone()
+    for view, grid in enumerate(grids):
+        if grid is None:
+            continue
+        if depth is not None:
+            moved, known = warp_known(depth[view], depth[view] > 0, grid)
+            depth[view] = torch.where(known, moved, 0.0)
+        if evidence is not None:
+            evidence[view] = warp_maps(evidence[view], grid)
+    return replace(priors, depth=depth, evidence=evidence)

@@ -11,14 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.adaptation.augmentation import augment_view
+from sceneexpander.adaptation.augmentation import draw_warp, warp_priors
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import Grid
 from sceneexpander.adaptation.sampling import Batch
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.store import sha256_of_tensors, to_plain
+from sceneexpander.errors import UserError
 from sceneexpander.geometry.gauge import priors_relative_to
+from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.lookup import warp_maps
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.models.protocol import (
@@ -37,6 +40,7 @@ class AdaptationInputs:
 
     ``captured_priors`` describe the captured views alone, ``joint_priors`` the captured views followed by the inserted one; a
     step that does not see the inserted view uses the former, so that with p = 0 nothing of the inserted view reaches the student.
+    `adapt` brings the latter to the former's frame and scale, in which the anchors are.
     Models without priors get None for both.
     """
 
@@ -72,43 +76,71 @@ class ViewSource:
 
     def views(self, batch: Batch, step: int) -> StepViews:
         """The views of a batch: captured ones augmented, the inserted one as it is."""
-        images, grids = [], []
-        for index in batch.captured:
-            generator = child_generator(self.seed, f"adapt/augment/{step}/{index}")
-            image, grid = augment_view(self.inputs.captured[index], self.config.augment, generator)
-            images.append(image)
-            grids.append(grid)
-        return self._with_priors(batch, images, grids)
+        height, width = self.inputs.captured.shape[-2:]
+        grids = [
+            draw_warp(self.config.augment, height, width, child_generator(self.seed, f"adapt/augment/{step}/{index}"))
+            for index in batch.captured
+        ]
+        return self._with_priors(batch, grids)
 
     def plain_views(self, batch: Batch) -> StepViews:
         """The same views without augmentation."""
-        return self._with_priors(batch, [self.inputs.captured[index] for index in batch.captured], [])
+        return self._with_priors(batch, [None] * len(batch.captured))
 
-    def _with_priors(self, batch: Batch, images: list[Tensor], grids: list[Grid | None]) -> StepViews:
+    def _with_priors(self, batch: Batch, grids: list[Grid | None]) -> StepViews:
+        """The batch's views; a captured one with a grid is warped, and what is known of its pixels with it."""
         count = self.inputs.captured.shape[0]
         chosen = list(batch.captured)
+        stacked = self.inputs.captured[chosen]
         if batch.inserted:
-            images = [*images, self.inputs.inserted]
+            stacked = torch.cat([stacked, self.inputs.inserted[None]])
             chosen = [*chosen, count]
-        stacked = torch.stack(images)
         source = self.inputs.joint_priors if batch.inserted else self.inputs.captured_priors
         if isinstance(self.model, PreparesInputs):
             if batch.inserted not in self._measured:
                 views = count + batch.inserted
                 self._measured[batch.inserted] = self.model.measure(source, views, *stacked.shape[-2:])
-            prepared = self.model.prepare(stacked, self._measured[batch.inserted].select(chosen))
-            return StepViews(images=stacked, priors=None, prepared=prepared, grids=grids)
-        priors = None if source is None else source.select(chosen)
+            prepared = self.model.prepare(stacked, self._measured[batch.inserted].select(chosen), grids)
+            return StepViews(images=_warped(stacked, grids), priors=None, prepared=prepared, grids=grids)
+        priors = None if source is None else warp_priors(source.select(chosen), grids)
         if priors is not None and chosen[0] != 0:
             priors = priors_relative_to(priors, 0)
-        return StepViews(images=stacked, priors=priors, prepared=None, grids=grids)
+        return StepViews(images=_warped(stacked, grids), priors=priors, prepared=None, grids=grids)
+
+
+def _warped(images: Float[Tensor, "view 3 height width"], grids: list[Grid | None]) -> Tensor:
+    """The pictures, the first of them warped where there is a grid."""
+    images = images.clone()
+    for view, grid in enumerate(grids):
+        if grid is not None:
+            images[view] = warp_maps(images[view], grid)
+    return images
 
 
 def geometry_of(prediction: Prediction) -> ViewGeometry:
     """The part of a prediction that the losses read."""
     if prediction.depth is None or prediction.normals is None:
         raise ValueError("the adaptation needs the depth and normal heads")
-    return ViewGeometry(camera_vector=prediction.camera_vector, depth=prediction.depth, normals=prediction.normals)
+    return ViewGeometry(
+        camera_vector=prediction.camera_vector,
+        depth=prediction.depth,
+        normals=prediction.normals,
+        splats=None if prediction.gaussians is None else _splats_of(prediction.gaussians, prediction.depth),
+    )
+
+
+def _splats_of(gaussians: Gaussians, depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view height width 4"]:
+    """Opacities and log scales by pixel. Raises `UserError` for models that make another number of Gaussians."""
+    if len(gaussians) != depth.numel():
+        raise UserError(
+            "needs a model with one Gaussian per pixel", where="adapt.alpha_gaussian", fix="use 0 with this one"
+        )
+    return torch.cat([gaussians.opacities[:, None], gaussians.scales.log()], dim=1).view(*depth.shape, 4)
+
+
+def heads_of(config: AdaptConfig) -> frozenset[Head]:
+    """What the losses read."""
+    return GEOMETRY_HEADS | {Head.GAUSSIANS} if config.alpha_gaussian > 0 else GEOMETRY_HEADS
 
 
 def run_key(model: Reconstructor, inputs: AdaptationInputs, config: AdaptConfig, seed: int) -> str:

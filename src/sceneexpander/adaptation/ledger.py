@@ -28,7 +28,7 @@ Model = TypeVar("Model", bound=object)
 BUCKET_ELEMENTS = {"cpu": 1 << 18, "cuda": 1 << 23}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bucket:
     """Some adapted parameters in flat tensors, and where each lies in them."""
 
@@ -111,8 +111,7 @@ class WeightLedger:
             self._add_bucket(names)
 
     def _add_bucket(self, names: tuple[str, ...]) -> None:
-        parameters = [self.parameters[name] for name in names]
-        student = torch.cat([p.detach().flatten() for p in parameters])
+        student = torch.cat([self.parameters[name].detach().flatten() for name in names])
         bucket = Bucket(
             names=names,
             student=student,
@@ -120,12 +119,45 @@ class WeightLedger:
             start=self._kept_start(student),
             moments=make_moments(self.config.engine.moments, student, seed=_stream(self.seed, names)),
         )
+        self._bind(bucket)
+        self.buckets.append(bucket)
+
+    def _bind(self, bucket: Bucket) -> None:
+        """Make the models' parameters views into the bucket."""
+        parameters = [self.parameters[name] for name in bucket.names]
         for name, view, teacher_view in zip(
-            names, _views(bucket.student, parameters), _views(bucket.teacher, parameters), strict=True
+            bucket.names, _views(bucket.student, parameters), _views(bucket.teacher, parameters), strict=True
         ):
             self.parameters[name].data = view
             self.teacher_parameters[name].data = teacher_view
-        self.buckets.append(bucket)
+
+    def split_idle(self) -> None:
+        """Give parameters without a gradient a bucket apart from neighbours that have one: those take a step, they do not."""
+        for bucket in list(self.buckets):
+            idle = [self.parameters[name].grad is None for name in bucket.names]
+            if all(idle) or not any(idle):
+                continue
+            sizes = [self.parameters[name].numel() for name in bucket.names]
+            places = torch.split(torch.arange(sum(sizes), device=bucket.student.device), sizes)
+            parts = []
+            for wanted in (False, True):
+                chosen = [k for k, without in enumerate(idle) if without is wanted]
+                names = tuple(bucket.names[k] for k in chosen)
+                index = torch.cat([places[k] for k in chosen])
+                start = bucket.start[index.to(bucket.start.device)]
+                parts.append(
+                    Bucket(
+                        names=names,
+                        student=bucket.student[index],
+                        teacher=bucket.teacher[index],
+                        start=start.pin_memory() if bucket.start.is_pinned() else start,
+                        moments=bucket.moments.part(index, seed=_stream(self.seed, names)),
+                    )
+                )
+            at = self.buckets.index(bucket)
+            self.buckets[at : at + 1] = parts
+            for part in parts:
+                self._bind(part)
 
     def _kept_start(self, student: Tensor) -> Tensor:
         if not self.config.engine.start_on_host or student.device.type == "cpu":
@@ -143,9 +175,10 @@ class WeightLedger:
 
         The gradient of ``lambda_reg * L_reg``, 2 lambda (theta - theta_0), is exact and cheap, so it is added here and not by
         autograd. Returns the sum of (theta - theta_0)^2 before the step, the squared norm of the gradient, and how many elements
-        were restored. Gradients are consumed. A bucket without any gets no AdamW step, as in torch; the teacher still follows.
+        were restored. Gradients are consumed. A parameter without one gets no AdamW step, as in torch; the teacher still follows.
         """
         self.take_in()
+        self.split_idle()
         config = self.config
         rate = 2 * config.lambda_reg / (1 if config.drift is DriftForm.SUM else self.adapted)
         due = config.restore_interval and step % config.restore_interval == 0
@@ -168,12 +201,10 @@ class WeightLedger:
     def _gathered(self, bucket: Bucket) -> Tensor | None:
         """The gradients of a bucket in one tensor, taken from the parameters; None if there are none."""
         parameters = [self.parameters[name] for name in bucket.names]
-        if all(p.grad is None for p in parameters):
-            return None
-        parts = [(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in parameters]
+        parts = [p.grad.flatten() for p in parameters if p.grad is not None]
         for parameter in parameters:
             parameter.grad = None
-        return torch.cat(parts)
+        return torch.cat(parts) if parts else None
 
     def drift_by_module(self, depth: int) -> dict[str, float]:
         """Norm of theta - theta_0 by the first ``depth`` parts of the parameters' names."""

@@ -6,21 +6,24 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from sceneexpander.adaptation import plateau
 from sceneexpander.adaptation.checkpoint import Checkpoint
 from sceneexpander.adaptation.config import AdaptConfig, DriftForm
-from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, run_key
+from sceneexpander.adaptation.corrections import Corrections
+from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, geometry_of, heads_of, run_key
 from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import NonFiniteLoss
 from sceneexpander.adaptation.observe import Look, Observer, warnings_of
-from sceneexpander.adaptation.sampling import sample_batch
+from sceneexpander.adaptation.sampling import Batch, sample_batch
 from sceneexpander.adaptation.trainable import plain_state, trained_parts
+from sceneexpander.geometry.gauge import in_gauge_of
 from sceneexpander.models.protocol import Reconstructor, as_module
 
 _log = logging.getLogger(__name__)
@@ -45,6 +48,7 @@ class StepRecord:
     drift: float  # L_reg before lambda_reg
     gradient_norm: float
     restored: int
+    anchor_gaussian: float = 0.0  # beyond the paper, see `AdaptConfig.alpha_gaussian`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,11 +56,11 @@ class AdaptationResult:
     """theta* and the log, on the host. ``seconds`` is the wall time of the steps run by this call."""
 
     student: dict[str, Tensor]
-    teacher: dict[str, Tensor]
     records: tuple[StepRecord, ...]
     looks: tuple[Look, ...]
     steps_saved: int  # by stopping early
     seconds: float
+    corrections: Corrections | None = None  # of what was adapted to; None: whoever called knows
 
 
 def adapt(
@@ -91,12 +95,11 @@ def adapt(
     with trained_parts(model, config, seed=seed):
         run = Run(model, inputs, config, seed)
         run.go(log, Observer(run.learner, run.source, looks_folder), key, checkpoint_folder)
-        student, teacher = _on_host(run.learner.model), _on_host(run.learner.teacher)
+        student = _on_host(run.learner.model)
     for warning in warnings_of(log.looks):
         _log.warning("%s", warning)
     return AdaptationResult(
         student=student,
-        teacher=teacher,
         records=tuple(log.records),
         looks=tuple(log.looks),
         steps_saved=config.steps - len(log.records),
@@ -141,12 +144,23 @@ class Run:
     def __init__(self, model: Reconstructor, inputs: AdaptationInputs, config: AdaptConfig, seed: int) -> None:
         if inputs.captured.shape[0] != len(inputs.anchors.view_ids):
             raise ValueError(f"{inputs.captured.shape[0]} captured views, {len(inputs.anchors.view_ids)} anchors")
+        if inputs.captured_priors is not None and inputs.joint_priors is not None:
+            inputs = replace(inputs, joint_priors=in_gauge_of(inputs.captured_priors, inputs.joint_priors))
         self.inputs, self.config, self.seed = inputs, config, seed
+        self.source = ViewSource(model, inputs, config, seed=seed)
         anchors = ViewGeometry(
-            camera_vector=inputs.anchors.camera_vector, depth=inputs.anchors.depth, normals=inputs.anchors.normals
+            camera_vector=inputs.anchors.camera_vector,
+            depth=inputs.anchors.depth,
+            normals=inputs.anchors.normals,
+            splats=self._frozen_splats(model) if config.alpha_gaussian > 0 else None,
         )
         self.learner = Learner(model, anchors, config, seed=seed)
-        self.source = ViewSource(model, inputs, config, seed=seed)
+
+    @torch.no_grad()
+    def _frozen_splats(self, model: Reconstructor) -> Tensor | None:
+        """The captured views' Gaussians as the model makes them before its first step, from those views alone."""
+        everything = Batch(captured=tuple(range(len(self.inputs.captured))), inserted=False)
+        return geometry_of(self.source.plain_views(everything).predict(model, heads_of(self.config))).splats
 
     def go(self, log: RunLog, observer: Observer, key: str, checkpoint_folder: Path | None) -> None:
         """All steps that are left, with their looks and resume points."""
@@ -177,7 +191,7 @@ class Run:
         del losses  # and the activations with them
         done = ledger.update(step)
         if not math.isfinite(done.gradient):
-            raise NonFiniteLoss(f"the gradient is not finite at step {step}")
+            raise NonFiniteLoss("the gradient is not finite", step)
         drift = done.drift if config.drift is DriftForm.SUM else done.drift / ledger.adapted
         return StepRecord(
             step=step,

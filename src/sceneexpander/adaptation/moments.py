@@ -30,6 +30,10 @@ class Moments(Protocol):
         """Inverse of `state`."""
         ...
 
+    def part(self, index: Tensor, *, seed: int) -> Moments:
+        """The moments of some of the weights, which go on apart from the others."""
+        ...
+
 
 def make_moments(form: MomentsForm, weights: Tensor, *, seed: int) -> Moments:
     """Moments of zero for ``weights``; ``seed`` is that of the rounding in eight bits."""
@@ -58,6 +62,12 @@ class FullMoments:
         """See `Moments.load`."""
         for name, value in self.state().items():
             value.copy_(state[name])
+
+    def part(self, index: Tensor, *, seed: int) -> FullMoments:
+        """See `Moments.part`."""
+        made = FullMoments(self.first[index])
+        made.first, made.second, made.steps = self.first[index], self.second[index], self.steps.clone()
+        return made
 
 
 class ByteMoments:
@@ -99,6 +109,17 @@ class ByteMoments:
         for name, value in self.state().items():
             value.copy_(state[name])
         self.done = int(self.steps)
+
+    def part(self, index: Tensor, *, seed: int) -> ByteMoments:
+        """See `Moments.part`. Other weights share the scales now, so the bytes are rounded once more."""
+        first = _expand(self.first, self.first_scale, FIRST_ROOT)[: self.count][index]
+        second = _expand(self.second, self.second_scale, SECOND_ROOT)[: self.count][index]
+        made = ByteMoments(first, seed=seed)
+        made.steps, made.done = self.steps.clone(), self.done
+        generator = torch.Generator(first.device).manual_seed((seed + made.done) % 2**63)
+        made.first_scale = _compress(first, made.first, FIRST_ROOT, generator)
+        made.second_scale = _compress(second, made.second, SECOND_ROOT, generator)
+        return made
 
 
 def _fused_adamw(

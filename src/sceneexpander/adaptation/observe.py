@@ -24,7 +24,7 @@ from sceneexpander.models.protocol import ALL_HEADS
 from sceneexpander.splatting import render
 
 HARM_DB = 0.5  # loss of PSNR on captured views that is worth a warning
-LOOKED_AT = 3  # captured views that are rendered, evenly spread
+LOOKED_AT = 3  # captured views that are rendered, evenly spread over those with a camera
 MODULE_DEPTH = 2  # parts of a parameter's name that make its module
 MOST_DB = 100.0  # of equal pictures
 
@@ -58,7 +58,9 @@ class Observer:
         depth, gaussians = prediction.depth, prediction.gaussians
         if depth is None or gaussians is None or prediction.gaussian_depth is None:
             raise ValueError("a look needs the depth and Gaussian heads")
-        chosen = [*spread(count, LOOKED_AT), count]
+        posed = None if inputs.captured_priors is None else inputs.captured_priors.posed
+        placed = list(range(count)) if posed is None or not bool(posed.any()) else torch.nonzero(posed)[:, 0].tolist()
+        chosen = [*(placed[index] for index in spread(len(placed), LOOKED_AT)), count]
         drawn = render(
             gaussians, prediction.world_from_cam[chosen], prediction.intrinsics_px[chosen], height, width
         ).rgb.clamp(0, 1)

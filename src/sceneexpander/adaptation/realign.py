@@ -17,10 +17,11 @@ from torch import Tensor
 from sceneexpander.adaptation.config import Realign
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.gauge import posed_in_both
 from sceneexpander.geometry.lookup import grid_of_pixels, sample_at
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg, transform_points
-from sceneexpander.geometry.similarity import align_poses
+from sceneexpander.geometry.similarity import align_views
 
 _POINTS = 6000
 _BLURS_PX = (6.0, 3.0, 1.5)  # coarse to fine
@@ -77,6 +78,15 @@ def realign(
     return _refined(held, anchors, images, inserted, generator)
 
 
+def anchored_depth(captured: Priors, anchors: Anchors) -> Float[Tensor, "captured height width"]:
+    """The anchors' depth in the scale of the captured views' priors: a model may have chosen another."""
+    if captured.depth is None:
+        return anchors.depth
+    depth = captured.depth[: len(anchors.depth)]
+    known = depth > 0
+    return anchors.depth * float((depth[known] / anchors.depth[known]).median()) if bool(known.any()) else anchors.depth
+
+
 def _parts(priors: Priors) -> tuple[Tensor, Tensor, Tensor]:
     if priors.world_from_cam is None or priors.intrinsics_px is None or priors.depth is None:
         raise ValueError("realignment needs priors with poses, intrinsics and depth")
@@ -84,14 +94,16 @@ def _parts(priors: Priors) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _held(captured: Priors, joint: Priors) -> Priors:
-    """The captured views' priors followed by the inserted view's, brought into their frame and scale."""
+    """The captured views' priors followed by the inserted view's, brought into their frame and scale.
+
+    Placeholders of cameras take no part in that; if no captured view has a camera on both sides, all do.
+    """
     poses, intrinsics, depth = _parts(captured)
     joint_poses, joint_intrinsics, joint_depth = _parts(joint)
     count = len(poses)
-    known = (depth > 0) & (joint_depth[:count] > 0)
-    scale = float((depth / joint_depth[:count])[known].median())
-    similarity = align_poses(joint_poses[:count], poses, scale=scale)
-    last_depth = joint_depth[count:] * scale
+    both = posed_in_both(captured, joint, count)
+    similarity = align_views(joint_poses[:count], joint_depth[:count], poses, depth, posed=both)
+    last_depth = joint_depth[count:] * similarity.scale
     return replace(
         captured,
         world_from_cam=torch.cat([poses, similarity.poses(joint_poses[count:])]),
@@ -116,8 +128,12 @@ def _refined(
     """Direct image alignment of the inserted camera with the captured points, then the scale of its depth."""
     poses, intrinsics, depth = _parts(held)
     count = len(images)
-    points = unproject_to_world(anchors.depth, intrinsics[:count], poses[:count]).reshape(-1, 3)
-    colours = images.movedim(1, -1).reshape(-1, 3)
+    seen = torch.arange(count, device=poses.device)
+    if held.posed is not None and bool(held.posed[:count].any()):
+        seen = seen[held.posed[:count]]  # where the points of a placeholder are means nothing
+    own = anchored_depth(held, anchors)
+    points = unproject_to_world(own[seen], intrinsics[seen], poses[seen]).reshape(-1, 3)
+    colours = images[seen].movedim(1, -1).reshape(-1, 3)
     chosen = torch.randperm(len(points), generator=generator)[: 4 * _POINTS].to(points.device)
     points, colours = points[chosen], colours[chosen]
     visible = _in_frame(points, poses[-1], intrinsics[-1], depth[-1])
@@ -134,7 +150,7 @@ def _refined(
     pose = rigid_inverse(cam_from_world)
     accepted = bool(torch.isfinite(pose).all()) and after < before
     factor = _depth_factor(points, cam_from_world, intrinsics[-1], depth[-1]) if accepted else 1.0
-    median = float(anchors.depth.median())
+    median = float(own.median())
     report = RealignReport(
         turned_deg=float(rotation_angle_deg(pose[:3, :3], poses[-1, :3, :3])) if accepted else 0.0,
         shifted=float((pose[:3, 3] - poses[-1, :3, 3]).norm()) / median if accepted else 0.0,

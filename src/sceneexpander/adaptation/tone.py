@@ -55,6 +55,7 @@ def match_tone(
     intrinsics_px: Float[Tensor, "view 3 3"],
     *,
     generated: Bool[Tensor, "view"],
+    posed: Bool[Tensor, "view"] | None = None,
     view: int,
 ) -> Tone | None:
     """Median ratios of the photos' colours to those of one view, over the surfaces that both show.
@@ -65,14 +66,16 @@ def match_tone(
         images: RGB in [0, 1].
         depth, world_from_cam, intrinsics_px: of all views, in one frame and scale.
         generated: these views are no photos, and not compared with.
+        posed: views whose camera was estimated; what a placeholder shows is not known. Default: all.
         view: whose tone is to change.
 
     Returns:
-        The gains, each within `LARGEST_GAIN` of 1; None where too little is seen in common (`LEAST_SHARE`).
+        The gains, each within `LARGEST_GAIN` of 1; None where too little is seen in common (`LEAST_SHARE`) or the view has no camera.
     """
     height, width = depth.shape[1:]
-    photos, one = torch.nonzero(~generated)[:, 0], slice(view, view + 1)
-    if len(photos) == 0:
+    placed = torch.ones_like(generated) if posed is None else posed
+    photos, one = torch.nonzero(~generated & placed)[:, 0], slice(view, view + 1)
+    if len(photos) == 0 or not bool(placed[view]):
         return None
     points = unproject_to_world(depth[one], intrinsics_px[one], world_from_cam[one]).reshape(-1, 3)
     content = torch.cat([images[photos], depth[photos, None]], dim=1)

@@ -18,7 +18,7 @@ SCHEMA = "anchors/1"
 class Anchors:
     """Eq. (anchor_ref): predictions of the frozen model for all n captured views together, without augmentation.
 
-    World frame and scale are those of that one prediction; ``gauge_view`` (always 0) is the view that defines the frame.
+    World frame and scale are those of that one prediction, whose first view defines the frame.
     """
 
     weights_sha256: str
@@ -28,7 +28,6 @@ class Anchors:
     depth_conf: Float[Tensor, "view height width"]
     normals: Float[Tensor, "view height width 3"]
     normals_conf: Float[Tensor, "view height width"]
-    gauge_view: int = 0
 
     def __post_init__(self) -> None:
         for name in _TENSORS:
@@ -40,7 +39,7 @@ class Anchors:
 
     def save(self, folder: Path) -> None:
         """Write into a (scratch) folder."""
-        facts = {"weights_sha256": self.weights_sha256, "view_ids": self.view_ids, "gauge_view": self.gauge_view}
+        facts = {"weights_sha256": self.weights_sha256, "view_ids": self.view_ids}
         save_artifact(folder, SCHEMA, facts, {name: getattr(self, name) for name in _TENSORS})
 
     @classmethod
@@ -51,4 +50,4 @@ class Anchors:
             return cls(**load_fields(cls, facts, tensors, folder))
 
 
-_TENSORS = tuple(f.name for f in fields(Anchors) if f.name not in {"weights_sha256", "view_ids", "gauge_view"})
+_TENSORS = tuple(f.name for f in fields(Anchors) if f.name not in {"weights_sha256", "view_ids"})

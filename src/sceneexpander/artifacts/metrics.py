@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,23 @@ from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed, 
 
 SCHEMA = "metrics/1"
 UNAVAILABLE_SCHEMA = "metrics-unavailable/1"
+
+
+class Fit(StrEnum):
+    """What was done to a reconstruction's Gaussians after they were predicted: only rows with the same can be compared.
+
+    ``FITTED``: fitted for seconds to the pictures that they were made from (`sceneexpander.optimisation.refine`). ``OPTIMISED``: the
+    same for minutes and with densification (`sceneexpander.optimisation.optimise`).
+    """
+
+    PREDICTED = "as predicted"
+    FITTED = "fitted"
+    OPTIMISED = "optimised"
+
+    @property
+    def mark(self) -> str:
+        """What stands behind a method's name; methods that optimise say so by their names."""
+        return " + fit" if self is Fit.FITTED else ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +86,8 @@ class MetricsRow:
     A view without a pose stands at a placeholder and shows little but its own Gaussians: it is in ``views`` and in no mean, and without
     a pose of the inserted view there are no ``inserted_`` numbers. ``captured_views_posed`` is the count behind the means; 0 means that
     no captured view has a pose, and then the means are over all of them.
-    ``navigation_coverage`` is the mean share of covered pixels over the frames of the navigation.
+    ``navigation_coverage`` is the mean share of covered pixels over the frames of the navigation. Unless ``fit`` says as predicted,
+    the numbers at the method's own cameras are those of pictures that its Gaussians were fitted to.
     """
 
     scene: str
@@ -96,6 +115,7 @@ class MetricsRow:
     navigation_frames: int = 0
     truth: TruthMetrics | None = None
     captured_views_posed: int | None = None
+    fit: Fit = Fit.PREDICTED
     repeats: int = 1
     spread: dict[str, float] = field(default_factory=dict)
     views: tuple[ViewMetrics, ...] = ()

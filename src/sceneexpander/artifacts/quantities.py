@@ -90,14 +90,15 @@ class Quantity:
 
 
 METHOD_TITLES = {
-    "captured": "captured only (ceiling of preservation)",
+    "captured": "before the insertion, captured photos only",
     "gaussian_splatting": "3DGS per scene, from the backbone's cameras and Gaussians",
     "omnivggt": "OmniVGGT (pixel-aligned Gaussians)",
     "omnivggt_optimised": "OmniVGGT (3DGS from its points and cameras)",
     "ttt3r": "TTT3R (pixel-aligned Gaussians)",
     "ttt3r_optimised": "TTT3R (3DGS from its points and cameras)",
     "backbone": "backbone with the inserted view, unadapted",
-    "sceneexpander": "SceneExpander",
+    "corrected": "corrections without a step of adaptation",
+    "sceneexpander": "SceneExpander (corrections and Algorithm 1)",
     "sceneexpander_optimised": "SceneExpander + post-optimisation (3DGS)",
 }
 

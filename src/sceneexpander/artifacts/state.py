@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.store import (
     FACTS_NAME,
     RERUN,
@@ -23,6 +26,7 @@ from sceneexpander.geometry.priors import Priors
 
 PRIORS_SCHEMA = "priors/1"
 WEIGHTS_SCHEMA = "weights-change/1"
+Loaded = TypeVar("Loaded")
 
 
 def save_priors(folder: Path, priors: Priors) -> None:
@@ -99,17 +103,45 @@ class _ChangeFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpansionState:
-    """Where a round starts: round 0 holds the captured views, round k also the views inserted in rounds 1..k."""
+    """Where a round starts: round 0 holds the captured views, round k also the views inserted in rounds 1..k.
+
+    Attributes:
+        views: every picture as it was given, which is what other methods take and what results are compared with.
+        priors: what geometry knows of them.
+        weights: adapted in the rounds so far.
+        first_weights: those of round 0, which no insertion has touched; None: ``weights`` are those.
+        toned: inserted views whose picture was brought to the photos' tone; None: there are none.
+        known: cameras of the first views, the captured ones, that were given and not estimated.
+    """
 
     views: ViewSet
     priors: Priors
     weights: WeightsChange
+    first_weights: WeightsChange | None = None
+    toned: ViewSet | None = None
+    known: KnownCameras | None = None
+
+    @property
+    def unadapted(self) -> WeightsChange:
+        """The weights before any insertion."""
+        return self.weights if self.first_weights is None else self.first_weights
+
+    @property
+    def toned_views(self) -> ViewSet:
+        """The views as the adaptation takes them: inserted pictures in the photos' tone."""
+        return self.views if self.toned is None else self.views.with_pictures_of(self.toned)
 
     def save(self, folder: Path) -> None:
         """Write into a (scratch) folder."""
         self.views.save(folder / "views")
         save_priors(folder / "priors", self.priors)
         self.weights.save(folder / "weights")
+        if self.first_weights is not None:
+            self.first_weights.save(folder / "first_weights")
+        if self.toned is not None:
+            self.toned.save(folder / "toned")
+        if self.known is not None:
+            self.known.save(folder / "known")
 
     @classmethod
     def load(cls, folder: Path) -> ExpansionState:
@@ -118,4 +150,11 @@ class ExpansionState:
             views=ViewSet.load(folder / "views"),
             priors=load_priors(folder / "priors"),
             weights=WeightsChange.load(folder / "weights"),
+            first_weights=_if_there(folder / "first_weights", WeightsChange.load),
+            toned=_if_there(folder / "toned", ViewSet.load),
+            known=_if_there(folder / "known", KnownCameras.load),
         )
+
+
+def _if_there(folder: Path, load: Callable[[Path], Loaded]) -> Loaded | None:
+    return load(folder) if folder.exists() else None

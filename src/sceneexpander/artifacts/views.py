@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ class ViewRecord:
     name: str  # the original file name
     original_height: int
     original_width: int
-    sha256: str  # of the original bytes
+    sha256: str  # of the original bytes; of the pixels for a picture that no file has, such as a toned one
     stored_from_original: Affine
     generated: bool = False
     round: int = 0  # 0: captured; k: inserted in round k
@@ -148,6 +148,16 @@ class ViewSet:
             detail_images=torch.cat([self.detail_images, other.detail_images]),
             valid=torch.cat([self.validity(), other.validity().to(self.images.device)]) if masked else None,
         )
+
+    def with_pictures_of(self, other: ViewSet) -> ViewSet:
+        """The same views, those that ``other`` has too taken from there, picture and record."""
+        place = {view_id: index for index, view_id in enumerate(other.view_ids)}
+        both = [(index, place[view_id]) for index, view_id in enumerate(self.view_ids) if view_id in place]
+        records, images, detail_images = list(self.records), self.images.clone(), self.detail_images.clone()
+        for index, there in both:
+            records[index] = other.records[there]
+            images[index], detail_images[index] = other.images[there], other.detail_images[there]
+        return replace(self, records=tuple(records), images=images, detail_images=detail_images)
 
     def validity(self) -> Bool[Tensor, "view height width"]:
         """``valid``, written out where everything is."""

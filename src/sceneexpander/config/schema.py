@@ -15,8 +15,7 @@ from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import GeneratorConfig
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
-from sceneexpander.optimisation.config import OptimiseConfig
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import OptimiseConfig, RefineConfig
 from sceneexpander.ranges import Range, check_ranges
 from sceneexpander.rendering import RenderConfig
 from sceneexpander.tracking import TrackingConfig

@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
+from sceneexpander.artifacts.metrics import Fit, MetricsRow, ViewMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
@@ -38,6 +38,7 @@ def evaluate(
     seed: int,
     navigation: Navigation | None = None,
     truth: SceneTruth | None = None,
+    fit: Fit = Fit.PREDICTED,
 ) -> MetricsRow:
     """Measure a reconstruction.
 
@@ -50,6 +51,7 @@ def evaluate(
         seed: for the row.
         navigation: frames for the coverage, if wanted.
         truth: known truth, if any.
+        fit: what was done to its Gaussians after they were predicted.
     """
     captured = preservation(reconstruction, views, config)
     inserted = insertion_fidelity(reconstruction, views, config)
@@ -79,6 +81,7 @@ def evaluate(
         gaussians=len(reconstruction.gaussians),
         generated_gaussians=int(reconstruction.gaussians.generated.sum()),
         captured_views_posed=len(posed),
+        fit=fit,
         psnr_db=_mean(row.psnr_db for row in counted),
         ssim=_mean(row.ssim for row in counted),
         coverage=_mean(row.coverage for row in counted),

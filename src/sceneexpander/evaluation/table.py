@@ -13,7 +13,7 @@ from sceneexpander.artifacts.quantities import METHOD_TITLES
 
 MISSING = "missing"
 NOT_APPLICABLE = "–"
-CEILING = "captured"
+BEFORE = "captured"  # the scene before the insertion: it shows nothing new
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +74,8 @@ def comparison_table(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -
 
     A mean over fewer cells than there are is followed by its count, e.g. ``21.40 (3/4)``; without any value the cell says ``missing``.
     Of methods that were run several times, the standard deviation over the runs follows (root mean square over the cells).
-    Columns that no row has a value for are left out. Means of lines with different counts cannot be compared.
+    Columns that no row has a value for are left out. Means of lines with different counts cannot be compared, nor lines whose Gaussians
+    were treated differently (``Gaussians``, see `Fit`).
 
     Raises:
         ValueError: two rows have the same scene, round, seed and method.
@@ -85,8 +86,9 @@ def comparison_table(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -
     lines = []
     for method in _methods(rows):
         done = str(sum((cell, method) in by_key for cell in cells))
-        lines.append((METHOD_TITLES.get(method, method), done, *_cell_texts(rows, by_key, cells, method, shown)))
-    header = ("method", f"cells of {len(cells)}", *(f"{column.title} {column.better}" for column in shown))
+        values = _cell_texts(rows, by_key, cells, method, shown)
+        lines.append((METHOD_TITLES.get(method, method), _fits(by_key, cells, method), done, *values))
+    header = ("method", "Gaussians", f"cells of {len(cells)}", *(f"{column.title} {column.better}" for column in shown))
     return Table(header=header, lines=tuple(lines))
 
 
@@ -98,8 +100,9 @@ def scene_table(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -> Tab
     for cell in _cells(rows):
         for method in _methods(rows):
             values = _cell_texts(rows, by_key, [cell], method, shown)
-            lines.append((cell[0], str(cell[1]), str(cell[2]), METHOD_TITLES.get(method, method), *values))
-    header = ("scene", "round", "seed", "method", *(f"{column.title} {column.better}" for column in shown))
+            title, fit = METHOD_TITLES.get(method, method), _fits(by_key, [cell], method)
+            lines.append((cell[0], str(cell[1]), str(cell[2]), title, fit, *values))
+    header = ("scene", "round", "seed", "method", "Gaussians", *(f"{column.title} {column.better}" for column in shown))
     return Table(header=header, lines=tuple(lines))
 
 
@@ -142,6 +145,12 @@ def _cell_texts(
     return [_cell_text(by_key, cells, method, column) for column in columns]
 
 
+def _fits(by_key: dict[tuple[Cell, str], MetricsRow], cells: Sequence[Cell], method: str) -> str:
+    """What was done to the method's Gaussians; more than one word if it was not the same in all cells."""
+    found = dict.fromkeys(by_key[cell, method].fit for cell in cells if (cell, method) in by_key)
+    return ", ".join(found) or NOT_APPLICABLE
+
+
 def _methods(rows: Sequence[Row]) -> list[str]:
     known = list(METHOD_TITLES)
     return sorted({row.method for row in rows}, key=lambda m: (known.index(m) if m in known else len(known), m))
@@ -149,11 +158,11 @@ def _methods(rows: Sequence[Row]) -> list[str]:
 
 def _value(by_key: dict[tuple[Cell, str], MetricsRow], cell: Cell, method: str, column: Column) -> float | None:
     row = by_key.get((cell, method))
-    if row is None or (column.expansion and method == CEILING):
+    if row is None or (column.expansion and method == BEFORE):
         return None
     if column.name != "coverage_gained":
         return row.value(column.name)
-    before = by_key.get((cell, CEILING))
+    before = by_key.get((cell, BEFORE))
     after = row.navigation_coverage
     if before is None or before.navigation_coverage is None or after is None:
         return None
@@ -161,7 +170,7 @@ def _value(by_key: dict[tuple[Cell, str], MetricsRow], cell: Cell, method: str, 
 
 
 def _cell_text(by_key: dict[tuple[Cell, str], MetricsRow], cells: Sequence[Cell], method: str, column: Column) -> str:
-    if column.expansion and method == CEILING:
+    if column.expansion and method == BEFORE:
         return NOT_APPLICABLE
     values = [value for cell in cells if (value := _value(by_key, cell, method, column)) is not None]
     if not values:

@@ -20,7 +20,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import psnr, ssim
 from sceneexpander.evaluation.perceptual import st_lpips
 from sceneexpander.geometry.gaussians import Gaussians
-from sceneexpander.geometry.similarity import align_poses
+from sceneexpander.geometry.similarity import align_views
 from sceneexpander.splatting import Render, render
 
 PSNR_CAP_DB = 100.0
@@ -64,8 +64,8 @@ def same_place(
 ) -> Float[Tensor, "frame 4 4"]:
     """Cameras given in the frame of ``source`` where they stand in the frame of ``target``.
 
-    The frames are aligned on the captured views that both have: orientations and centres of their cameras, and the median ratio of
-    their depths as scale (which, unlike camera distances, is determined for one view and steady for short baselines).
+    The frames are aligned on the captured views that both have, and whose cameras both have estimated if there are such: see
+    `align_views`.
 
     Raises:
         ValueError: the reconstructions share no captured view.
@@ -79,8 +79,13 @@ def same_place(
     if not pairs:
         raise ValueError("the reconstructions share no captured view")
     in_source, in_target = ([pair[side] for pair in pairs] for side in (0, 1))
-    scale = float((target.depth[in_target] / source.depth[in_source]).median())
-    similarity = align_poses(source.world_from_cam[in_source], target.world_from_cam[in_target], scale=scale)
+    similarity = align_views(
+        source.world_from_cam[in_source],
+        source.depth[in_source],
+        target.world_from_cam[in_target],
+        target.depth[in_target],
+        posed=source.posed[in_source] & target.posed[in_target],
+    )
     return similarity.poses(world_from_cam)
 
 

@@ -14,7 +14,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.truth import SceneTruth
-from sceneexpander.expandbench.prepared import place_in
+from sceneexpander.expandbench.prepared import placement_in
 from sceneexpander.expandbench.scenes import BenchScene, TrueView
 from sceneexpander.splatting import render
 
@@ -109,11 +109,8 @@ def picture_at(
     reconstruction: Reconstruction, scene: BenchScene, view: TrueView
 ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"], Float[Tensor, "height width"], float]:
     """(RGB on black, alpha, depth, scene units per metre) of a reconstruction at a true camera."""
-    placed = place_in(reconstruction, scene, view.world_from_cam[None])
-    apart = scene.captured_truth[scene.captured.records[0].sha256].depth
-    assert apart is not None  # noqa: S101 - every captured view has a depth
-    known = apart[1::2, 1::2]
-    scale = float((reconstruction.depth[0] / known)[known > 0].median())
+    placement = placement_in(reconstruction, scene)
+    placed = placement.poses(view.world_from_cam[None].double()).float()
     height, width = view.image.shape[1:]
     seen = render(reconstruction.gaussians, placed, view.intrinsics_px[None], height, width)
-    return seen.rgb[0], seen.alpha[0], seen.depth[0], scale
+    return seen.rgb[0], seen.alpha[0], seen.depth[0], float(placement.scale)

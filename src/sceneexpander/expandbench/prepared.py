@@ -19,19 +19,19 @@ from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.evaluation.truth import SceneTruth
 from sceneexpander.expandbench.grades import Grade
 from sceneexpander.expandbench.scenes import BenchScene
-from sceneexpander.expansion import LoadedModel, RoundInputs, captured_prediction, initial_state, refined
+from sceneexpander.expansion import LoadedModel, RoundInputs, captured_prediction, initial_state
 from sceneexpander.expansion.rounds import reconstruct, views_priors
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.geometry.gauge import in_gauge_of
 from sceneexpander.geometry.priors import Priors
-from sceneexpander.geometry.similarity import align_poses
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.geometry.similarity import Similarity, align_views
 
-SEED = 0  # of the front-end and the warm-up: the same pre-insertion scene for every row and seed
+SEED = 0  # of the front-end and the warm-up: the same estimate for every row and seed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreparedScene:
-    """The pre-insertion scene: theta_0, its anchors, and the reconstruction from the captured views alone."""
+    """The pre-insertion scene: theta_0, its anchors, and the reconstruction from the captured views alone, as predicted."""
 
     state: ExpansionState
     anchors: Anchors
@@ -40,10 +40,9 @@ class PreparedScene:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreparedCase:
-    """A scene with a view inserted: what `adapt_round` starts from, the baseline, and the truth about all views."""
+    """A scene with a view inserted: what `adapt_round` starts from, the baseline as predicted, and the truth about all views."""
 
     inputs: RoundInputs
-    captured: Reconstruction
     backbone: Reconstruction
     truth: SceneTruth
 
@@ -53,7 +52,6 @@ def prepare_scene(
     loaded: LoadedModel,
     frontend: FrontendConfig,
     warmup: WarmupConfig,
-    refine: RefineConfig,
     cache: Path,
 ) -> PreparedScene:
     """The pre-insertion scene, from ``cache`` (a folder of this scene, model and configuration) if it is there."""
@@ -62,7 +60,6 @@ def prepare_scene(
         whole = Scene(name=scene.name, views=scene.captured, rounds=(RoundSpec(prompt="see more"),))
         state, _, _, _ = initial_state(whole, loaded, frontend, warmup, seed=SEED)
         anchors, reconstruction = captured_prediction(state, loaded)
-        reconstruction, _ = refined(reconstruction, state.views, refine, doubt_generated=True, seed=SEED)
         with directory_being_written(folder) as scratch:
             state.save(scratch / "state")
             anchors.save(scratch / "anchors")
@@ -80,7 +77,6 @@ def prepare_case(
     grade: Grade,
     loaded: LoadedModel,
     frontend: FrontendConfig,
-    refine: RefineConfig,
     cache: Path,
 ) -> PreparedCase:
     """The scene with a view of the given grade inserted, from ``cache`` (the scene's folder) if it is there."""
@@ -90,10 +86,10 @@ def prepare_case(
     folder = cache / grade.name
     if not folder.exists():
         views = prepared.state.views.append(view)
-        known = _intended_cameras(scene, prepared) if grade.told else None
-        priors, _ = views_priors(views, loaded, frontend, seed=SEED, known=known)
+        known = _intended_cameras(scene, prepared) if grade.told else None  # the only truth that a method is ever given
+        estimated, _ = views_priors(views, loaded, frontend, seed=SEED, known=known)
+        priors = in_gauge_of(prepared.state.priors, estimated)
         backbone = reconstruct(views, priors, loaded, prepared.state.weights, method="backbone")
-        backbone, _ = refined(backbone, views, refine, doubt_generated=False, seed=SEED)
         with directory_being_written(folder) as scratch:
             save_priors(scratch / "priors", priors)
             backbone.save(scratch / "backbone")
@@ -104,7 +100,6 @@ def prepare_case(
             anchors=prepared.anchors,
             joint_priors=load_priors(folder / "priors"),
         ),
-        captured=prepared.captured,
         backbone=Reconstruction.load(folder / "backbone"),
         truth=truth,
     )
@@ -126,22 +121,25 @@ def _required(priors: Priors) -> tuple[Tensor, Tensor]:
     return priors.world_from_cam, priors.intrinsics_px
 
 
+def placement_in(reconstruction: Reconstruction, scene: BenchScene) -> Similarity:
+    """From the truth's frame and scale to a reconstruction's own: aligned on the captured views.
+
+    Orientations and centres of the captured cameras that were estimated give the frame, the median ratio of their depths the scale.
+    """
+    truth = [scene.captured_truth[record.sha256] for record in scene.captured.records]
+    depths = [torch.zeros_like(reconstruction.depth[0]) if t.depth is None else t.depth[1::2, 1::2] for t in truth]
+    captured = len(truth)
+    return align_views(
+        torch.stack([t.world_from_cam for t in truth]),
+        torch.stack(depths),
+        reconstruction.world_from_cam[:captured].double(),
+        reconstruction.depth[:captured],
+        posed=reconstruction.posed[:captured],
+    )
+
+
 def place_in(
     reconstruction: Reconstruction, scene: BenchScene, world_from_cam: Float[Tensor, "view 4 4"]
 ) -> Float[Tensor, "view 4 4"]:
-    """True camera poses where they stand in a reconstruction's own frame and scale: aligned on the captured views.
-
-    Orientations and centres of the captured cameras give the frame, the median ratio of their depths the scale.
-    """
-    true_poses, ratios = [], []
-    captured = len(scene.captured)
-    for index, record in enumerate(scene.captured.records):
-        truth = scene.captured_truth[record.sha256]
-        true_poses.append(truth.world_from_cam)
-        if truth.depth is not None:
-            depth = truth.depth[1::2, 1::2]
-            ratios.append((reconstruction.depth[index] / depth)[depth > 0])
-    scale = float(torch.cat(ratios).median())
-    estimated = reconstruction.world_from_cam[:captured].double()
-    similarity = align_poses(torch.stack(true_poses), estimated, scale=scale)
-    return similarity.poses(world_from_cam.double()).float()
+    """True camera poses where they stand in a reconstruction, see `placement_in`."""
+    return placement_in(reconstruction, scene).poses(world_from_cam.double()).float()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -20,17 +21,16 @@ from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import WeightsChange
 from sceneexpander.artifacts.store import read_json, to_plain, write_json_atomic
-from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.measure import BenchNumbers, measure
 from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.scenes import BenchScene, build_scene
-from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model, refined
+from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model, refined, refined_round
 from sceneexpander.expansion.rounds import RoundInputs, adapted_weights, aligned, finished_round, reconstruct
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 
-CAPTURED = "captured"  # the pre-insertion scene: the ceiling of preservation
+CAPTURED = "captured"  # the pre-insertion scene
 BASELINE = "baseline"  # the same weights given the inserted view
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,10 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """Which cells. ``rows`` are configurations by name; `CAPTURED` and `BASELINE` are always measured."""
+    """Which cells. ``rows`` are configurations by name; `CAPTURED` and `BASELINE` are always measured, with every seed.
+
+    The seed is that of the adaptation and of the fit: rows of one scene, grade and seed differ in nothing but the row.
+    """
 
     scenes: tuple[str, ...]
     grades: tuple[str, ...]
@@ -60,8 +63,7 @@ class Plan:
     seeds: tuple[int, ...]
 
     def __len__(self) -> int:
-        adapted = len(self.rows) * len(self.seeds)
-        return len(self.scenes) * (1 + len(self.grades) * (1 + adapted))
+        return len(self.scenes) * len(self.seeds) * (1 + len(self.grades) * (1 + len(self.rows)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,9 +134,11 @@ class _Worker:
 
     def __init__(self, name: str, settings: Settings) -> None:
         self.name, self.settings = name, settings
-        shared = {name: getattr(settings, name) for name in ("model", "frontend", "warmup", "refine")}
-        self.shared = json.dumps(to_plain(shared), sort_keys=True)
-        key = hashlib.sha256(f"{self.shared}:{settings.code if not settings.any_code else ''}".encode()).hexdigest()
+        before = {name: to_plain(getattr(settings, name)) for name in ("model", "frontend", "warmup")}
+        self.shared = json.dumps(before | {"refine": to_plain(settings.refine)}, sort_keys=True)
+        # What the fit starts from is the same whatever the fit.
+        code = "" if settings.any_code else settings.code
+        key = hashlib.sha256(f"{json.dumps(before, sort_keys=True)}:{code}".encode()).hexdigest()
         self.folder = settings.cache / "prepared" / key[:16] / name
         self._scene: BenchScene | None = None
         self._loaded: LoadedModel | None = None
@@ -155,29 +159,38 @@ class _Worker:
                 return known
         if self.settings.finished_only:
             return None
-        result = self._measured(grade, row, seed, config)
+        checkpoints = self.settings.cache / "ckpt" / f"{key[:32]}-{self.settings.code[:32]}"
+        result = self._measured(grade, row, seed, config, checkpoints)
         write_json_atomic(path, result)
+        if checkpoints.exists():
+            shutil.rmtree(checkpoints)
         return result
 
-    def _measured(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult:
+    def _measured(
+        self, grade: str, row: str, seed: int, config: AdaptConfig | None, checkpoints: Path | None = None
+    ) -> CellResult:
         torch.set_num_threads(self.settings.threads)
         alone: BenchNumbers | None = None
         seconds, steps = 0.0, 0
+        fit = self.settings.refine
         if row == CAPTURED:
-            reconstruction = self.prepared.captured
-            case = None
+            case, before = None, self.prepared
+            reconstruction, _ = refined(before.captured, before.state.views, fit, doubt_generated=False, seed=seed)
         else:
             case = self.case(grade)
-            reconstruction = case.backbone
-        if config is not None and case is not None:
-            inputs, weights, seconds, steps = self._adapted(grade, case, config, seed)
-            started = time.perf_counter()
-            state, reconstruction = finished_round(inputs, weights, self.loaded, config, seed=seed)
-            reconstruction = self._refined(reconstruction, state.views, config, seed)
-            seconds += time.perf_counter() - started
-            before = inputs.state
-            without = reconstruct(before.views, before.priors, self.loaded, state.weights, method="alone")
-            alone = self._numbers(self._refined(without, before.views, config, seed), None)
+            if config is None:
+                views = case.inputs.state.views.append(case.inputs.inserted.view)
+                reconstruction, _ = refined(case.backbone, views, fit, doubt_generated=False, seed=seed)
+            else:
+                inputs, weights, seconds, steps = self._adapted(grade, case, config, seed, checkpoints)
+                started = time.perf_counter()
+                state, reconstruction = finished_round(inputs, weights, self.loaded, config, seed=seed)
+                reconstruction, _ = refined_round(reconstruction, state, config, fit, seed=seed)
+                seconds += time.perf_counter() - started
+                start = inputs.state
+                without = reconstruct(start.views, start.priors, self.loaded, state.weights, method="alone")
+                without, _ = refined(without, start.views, fit, doubt_generated=False, seed=seed)
+                alone = self._numbers(without, None)
         return CellResult(
             scene=self.name,
             grade=grade,
@@ -191,13 +204,8 @@ class _Worker:
             candidate=judge_round(case.inputs) if case is not None and row == BASELINE else None,
         )
 
-    def _refined(
-        self, reconstruction: Reconstruction, views: ViewSet, config: AdaptConfig, seed: int
-    ) -> Reconstruction:
-        return refined(reconstruction, views, self.settings.refine, doubt_generated=config.trust, seed=seed)[0]
-
     def _adapted(
-        self, grade: str, case: PreparedCase, config: AdaptConfig, seed: int
+        self, grade: str, case: PreparedCase, config: AdaptConfig, seed: int, checkpoints: Path | None
     ) -> tuple[RoundInputs, WeightsChange, float, int]:
         """(aligned inputs, weights, seconds, steps) of Algorithm 1 alone: rows that differ in what follows share it. The last is kept."""
         shared = replace(config, trust=False, close_gaps=0.0, splat_steps=0)
@@ -205,7 +213,13 @@ class _Worker:
         if self._last is None or self._last[0] != key:
             started = time.perf_counter()
             inputs = aligned(case.inputs, self.loaded, config, seed=seed)
-            weights, result = adapted_weights(inputs, self.loaded, config, seed=seed)
+            weights, result = adapted_weights(
+                inputs,
+                self.loaded,
+                config,
+                seed=seed,
+                checkpoint_folder=checkpoints if config.checkpoint_every else None,
+            )
             self._last = key, (inputs, weights, time.perf_counter() - started, len(result.records))
         return self._last[1]
 
@@ -234,24 +248,22 @@ class _Worker:
         """The pre-insertion scene."""
         if self._prepared is None:
             s = self.settings
-            self._prepared = prepare_scene(self.scene, self.loaded, s.frontend, s.warmup, s.refine, self.folder)
+            self._prepared = prepare_scene(self.scene, self.loaded, s.frontend, s.warmup, self.folder)
         return self._prepared
 
     def case(self, grade: str) -> PreparedCase:
         """The scene with a view of that grade inserted."""
         if grade not in self._cases:
             s, chosen = self.settings, grade_named(grade)
-            self._cases[grade] = prepare_case(
-                self.scene, self.prepared, chosen, self.loaded, s.frontend, s.refine, self.folder
-            )
+            self._cases[grade] = prepare_case(self.scene, self.prepared, chosen, self.loaded, s.frontend, self.folder)
         return self._cases[grade]
 
 
 def _scene_cells(name: str, plan: Plan, settings: Settings) -> Iterator[CellResult]:
     worker = _Worker(name, settings)
-    wanted: list[tuple[str, str, int, AdaptConfig | None]] = [("", CAPTURED, 0, None)]
+    wanted: list[tuple[str, str, int, AdaptConfig | None]] = [("", CAPTURED, seed, None) for seed in plan.seeds]
     for grade in plan.grades:
-        wanted.append((grade, BASELINE, 0, None))
+        wanted += [(grade, BASELINE, seed, None) for seed in plan.seeds]
         wanted += [(grade, row, seed, config) for row, config in plan.rows.items() for seed in plan.seeds]
     for cell in wanted:
         result = worker.cell(*cell)

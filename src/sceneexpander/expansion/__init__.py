@@ -6,10 +6,12 @@ from sceneexpander.expansion.rounds import (
     RoundInputs,
     adapt_round,
     captured_prediction,
+    correct_round,
     initial_state,
     joint_reconstruction,
     judge_round,
     refined,
+    refined_round,
 )
 
 __all__ = [
@@ -19,11 +21,13 @@ __all__ = [
     "RoundInputs",
     "adapt_round",
     "captured_prediction",
+    "correct_round",
     "initial_state",
     "joint_reconstruction",
     "judge_round",
     "load_model",
     "refined",
+    "refined_round",
     "report_cameras",
     "straighten_views",
 ]

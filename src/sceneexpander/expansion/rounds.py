@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
-from sceneexpander.adaptation.acceptance import Acceptance, AcceptanceLimits, judge_candidate
-from sceneexpander.adaptation.config import AdaptConfig, Realign
+from sceneexpander.adaptation.acceptance import Acceptance, AcceptanceLimits, captured_moved, judge_candidate
+from sceneexpander.adaptation.config import AdaptConfig, Realign, Spend
 from sceneexpander.adaptation.consistency import pixel_trust, trusted
+from sceneexpander.adaptation.corrections import Corrections, Estimate
 from sceneexpander.adaptation.gaps import closed
 from sceneexpander.adaptation.gaussian_head import fit_gaussian_head
 from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, StepRecord, adapt
@@ -25,17 +27,20 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import KnownCameras, Scene
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
+from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.expansion.cameras import announce_cameras, report_cameras, straighten_views
 from sceneexpander.expansion.loaded import LoadedModel
-from sceneexpander.expansion.optics import optics_of
+from sceneexpander.expansion.optics import known_of, optics_of
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
+from sceneexpander.geometry.gauge import in_gauge_of, posed_in_both
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.protocol import Prediction
-from sceneexpander.optimisation.refine import RefineConfig, RefineReport, refine
+from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.optimisation.refine import RefineReport, refine
 from sceneexpander.splatting import render
 
 _log = logging.getLogger(__name__)
@@ -43,12 +48,28 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoundInputs:
-    """What a round starts from."""
+    """What a round starts from.
+
+    ``joint_priors`` have the gauge of the state's (`in_gauge_of`). ``toned`` is the inserted view in the photos' tone, which the
+    adaptation takes instead of the given one (None: as given); ``corrections`` say what `aligned` changed.
+    """
 
     state: ExpansionState
     inserted: InsertedView
     anchors: Anchors
     joint_priors: Priors
+    toned: ViewSet | None = None
+    corrections: Corrections = field(default_factory=Corrections)
+
+    @property
+    def inserted_view(self) -> ViewSet:
+        """The inserted view as the adaptation takes it."""
+        return self.inserted.view if self.toned is None else self.toned
+
+    @property
+    def views(self) -> ViewSet:
+        """All views as the adaptation takes them, the inserted one last."""
+        return self.state.toned_views.append(self.inserted_view)
 
 
 def views_priors(
@@ -59,10 +80,13 @@ def views_priors(
     seed: int,
     known: KnownCameras | None = None,
 ) -> tuple[Priors, SparseReconstruction | None]:
-    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing."""
+    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing.
+
+    ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told.
+    """
     if not loaded.uses_front_end:
         return Priors(), None
-    complete = known is not None and known.world_from_cam is not None
+    known = known_of(views, known)
     if any(
         record.distortion != (0.0, 0.0) for record in views.records
     ):  # straightened before; what is left is nothing to look for
@@ -73,7 +97,7 @@ def views_priors(
         generator=child_generator(seed, "frontend"),
         feature_images=views.detail_images,
         known_intrinsics_px=None if known is None else known.intrinsics_px,
-        known_world_from_cam=known.world_from_cam if complete and known is not None else None,
+        known_world_from_cam=None if known is None else known.world_from_cam,
         names=[record.name for record in views.records],
         optics=optics_of(views),
         valid=views.valid,
@@ -108,7 +132,7 @@ def initial_state(
         on_step=on_step,
     )
     weights = WeightsChange.between(loaded.base, loaded.state())
-    state = ExpansionState(views=views, priors=priors, weights=weights)
+    state = ExpansionState(views=views, priors=priors, weights=weights, known=scene.known)
     return state, reconstruct(state.views, priors, loaded, weights, method="captured"), sparse, report
 
 
@@ -140,7 +164,7 @@ def captured_prediction(state: ExpansionState, loaded: LoadedModel) -> tuple[Anc
 
     The views of the state are all views so far: from round 2 on, those inserted before are anchored too (and stay marked as generated).
     """
-    reconstruction = reconstruct(state.views, state.priors, loaded, state.weights, method="captured")
+    reconstruction = reconstruct(state.toned_views, state.priors, loaded, state.weights, method="captured")
     anchors = Anchors(
         weights_sha256=reconstruction.weights_sha256,
         view_ids=reconstruction.view_ids,
@@ -161,14 +185,19 @@ def joint_reconstruction(
     *,
     seed: int,
 ) -> tuple[Priors, Reconstruction, SparseReconstruction | None]:
-    """The baseline: the unadapted model given all views, the inserted one last and treated like any other."""
+    """The baseline: the unadapted model given all views as they are, the inserted one last and treated like any other.
+
+    In every round: its weights are those of round 0, and no picture is in another tone. The priors come back in the frame and scale of
+    the state's, so that what was known before can be compared with them; the front-end's own findings are in their own scale.
+    """
     views = state.views.append(inserted.view)
-    priors, sparse = views_priors(views, loaded, frontend, seed=seed)
+    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known)
+    priors = in_gauge_of(state.priors, priors)
     if sparse is not None:
         announce_cameras(
             report_cameras(views, sparse), strict=False
         )  # a generated view may be left out: that is a result
-    return priors, reconstruct(views, priors, loaded, state.weights, method="backbone"), sparse
+    return priors, reconstruct(views, priors, loaded, state.unadapted, method="backbone"), sparse
 
 
 def adapt_round(
@@ -194,19 +223,34 @@ def adapt_round(
         on_look=on_look,
         looks_folder=looks_folder,
     )
-    return *finished_round(inputs, weights, loaded, config, seed=seed), result
+    expanded, reconstruction = finished_round(inputs, weights, loaded, config, seed=seed)
+    return expanded, reconstruction, replace(result, corrections=inputs.corrections)
+
+
+def correct_round(
+    inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig, *, seed: int
+) -> tuple[ExpansionState, Reconstruction, Corrections]:
+    """The round without a step: everything that is beyond the paper (`aligned`, `finished_round`) with the weights it starts from.
+
+    What `adapt_round` brings more is Algorithm 1's. The reconstruction is of the method ``corrected``.
+    """
+    still = replace(config, steps=0, splat_steps=0)
+    inputs = aligned(inputs, loaded, still, seed=seed)
+    state, reconstruction = finished_round(inputs, inputs.state.weights, loaded, still, seed=seed)
+    return state, replace(reconstruction, method="corrected"), inputs.corrections
 
 
 def aligned(inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig, *, seed: int) -> RoundInputs:
     """What the adaptation takes instead of the given estimate and picture: `realigned_priors`, and the photos' tone (`match_tone`)."""
-    inputs = replace(inputs, joint_priors=realigned_priors(inputs, loaded, config.realign, seed=seed))
+    priors, corrections = realigned_priors(inputs, loaded, config.realign, seed=seed)
+    inputs = replace(inputs, joint_priors=priors, corrections=corrections)
     return toned(inputs, loaded) if config.tone else inputs
 
 
 def toned(inputs: RoundInputs, loaded: LoadedModel) -> RoundInputs:
     """The inserted picture in the photos' tone, by the geometry of the weights that the round starts from."""
     inserted = inputs.inserted
-    views = inputs.state.views.append(inserted.view)
+    views = inputs.state.toned_views.append(inserted.view)
     seen = predict(views, inputs.joint_priors, loaded, inputs.state.weights)
     if seen.depth is None:
         raise ValueError("the tone is compared by means of the depth head")
@@ -216,6 +260,7 @@ def toned(inputs: RoundInputs, loaded: LoadedModel) -> RoundInputs:
         seen.world_from_cam.cpu(),
         seen.intrinsics_px.cpu(),
         generated=views.generated,
+        posed=inputs.joint_priors.posed,
         view=len(views) - 1,
     )
     if tone is None:
@@ -223,8 +268,10 @@ def toned(inputs: RoundInputs, loaded: LoadedModel) -> RoundInputs:
         return inputs
     _log.info("the inserted picture x (%.2f, %.2f, %.2f) has the photos' tone", *tone.gains)
     view = inserted.view
-    changed = replace(view, images=tone.applied(view.images), detail_images=tone.applied(view.detail_images))
-    return replace(inputs, inserted=replace(inserted, view=changed))
+    images = tone.applied(view.images)
+    record = replace(view.records[0], sha256=sha256_of_tensors({"toned": images}))
+    changed = replace(view, records=(record,), images=images, detail_images=tone.applied(view.detail_images))
+    return replace(inputs, toned=changed, corrections=replace(inputs.corrections, gains=tone.gains))
 
 
 def adapted_weights(
@@ -238,14 +285,16 @@ def adapted_weights(
     on_look: Callable[[Look], None] | None = None,
     looks_folder: Path | None = None,
 ) -> tuple[WeightsChange, AdaptationResult]:
-    """Algorithm 1 alone, on inputs as `aligned` leaves them."""
+    """Algorithm 1 alone, on inputs as `aligned` leaves them; without a step where `Spend` does not want any."""
     state = inputs.state
+    if config.steps and not worth_adapting(inputs, loaded, config):
+        config = replace(config, steps=0)
     loaded.apply(state.weights)
     result = adapt(
         loaded.model,
         AdaptationInputs(
-            captured=state.views.images.to(loaded.device),
-            inserted=inputs.inserted.view.images[0].to(loaded.device),
+            captured=state.toned_views.images.to(loaded.device),
+            inserted=inputs.inserted_view.images[0].to(loaded.device),
             anchors=_device_anchors(inputs.anchors, loaded),
             captured_priors=_device_priors(state.priors, loaded),
             joint_priors=_device_priors(inputs.joint_priors, loaded),
@@ -261,11 +310,27 @@ def adapted_weights(
     return (WeightsChange.between(loaded.base, result.student) if config.steps else state.weights), result
 
 
+def worth_adapting(inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig) -> bool:
+    """Whether the round runs its steps, see `Spend`: told by what the weights it starts from make of all views."""
+    if config.spend is Spend.ALWAYS:
+        return True
+    seen = predict(inputs.views, inputs.joint_priors, loaded, inputs.state.weights)
+    if seen.depth is None:
+        raise ValueError("the anchors are compared with the depth head")
+    count, posed = len(inputs.state.views), inputs.joint_priors.posed
+    moved = captured_moved(inputs.anchors, seen.depth[:count].cpu(), None if posed is None else posed[:count])
+    worth = moved > config.spend_above
+    _log.info(
+        "the insertion moves the captured depth by %.2f %%: %s", 100 * moved, "steps" if worth else "nothing to repair"
+    )
+    return worth
+
+
 def finished_round(
     inputs: RoundInputs, weights: WeightsChange, loaded: LoadedModel, config: AdaptConfig, *, seed: int
 ) -> tuple[ExpansionState, Reconstruction]:
     """The expanded scene with adapted weights, after what may follow Algorithm 1: the Gaussian head, closing of gaps, and fading."""
-    views, joint_priors = inputs.state.views.append(inputs.inserted.view), inputs.joint_priors
+    state, views, joint_priors = inputs.state, inputs.views, inputs.joint_priors
     if config.splat_steps:
         loaded.apply(weights)
         fit_gaussian_head(
@@ -278,9 +343,22 @@ def finished_round(
         )
         weights = WeightsChange.between(loaded.base, loaded.state())
     reconstruction = reconstruct(views, joint_priors, loaded, weights, method="sceneexpander")
-    expanded = ExpansionState(views=views, priors=joint_priors, weights=weights)
+    expanded = ExpansionState(
+        views=state.views.append(inputs.inserted.view),
+        priors=joint_priors,
+        weights=weights,
+        first_weights=state.unadapted,
+        toned=_joined(state.toned, inputs.toned),
+        known=state.known,
+    )
     reconstruction = closed(reconstruction, config.close_gaps)
     return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction
+
+
+def _joined(before: ViewSet | None, new: ViewSet | None) -> ViewSet | None:
+    if before is None or new is None:
+        return before if new is None else new
+    return before.append(new)
 
 
 def refined(
@@ -299,12 +377,34 @@ def refined(
     otherwise it counts like a photo, as for the baseline, which does not know better. Pixels that do not show the place count nothing.
     """
     weights = None
-    if config.steps and doubt_generated and bool(reconstruction.generated.any()):
+    if config.visits and doubt_generated and bool(reconstruction.generated.any()):
         weights = pixel_trust(reconstruction, views.images)
     if views.valid is not None:
         shown = views.valid.to(reconstruction.depth)
         weights = shown if weights is None else weights * shown
     return refine(reconstruction, views.images, config, weights=weights, seed=seed, device=device, on_step=on_step)
+
+
+def refined_round(
+    reconstruction: Reconstruction,
+    state: ExpansionState,
+    adapt: AdaptConfig,
+    config: RefineConfig,
+    *,
+    seed: int,
+    device: torch.device | str = "cpu",
+    on_step: Callable[[int, float], None] | None = None,
+) -> tuple[Reconstruction, RefineReport | None]:
+    """`refined` for the expanded scene of a round: to the pictures that the round worked with, doubting the generated as ``trust`` says."""
+    return refined(
+        reconstruction,
+        state.toned_views,
+        config,
+        doubt_generated=adapt.trust,
+        seed=seed,
+        device=device,
+        on_step=on_step,
+    )
 
 
 def judge_round(inputs: RoundInputs) -> Acceptance | None:
@@ -322,29 +422,41 @@ def judge_round(inputs: RoundInputs) -> Acceptance | None:
     )
 
 
-def realigned_priors(inputs: RoundInputs, loaded: LoadedModel, mode: Realign, *, seed: int) -> Priors:
-    """The joint priors as the adaptation takes them, see `realign`.
+def realigned_priors(
+    inputs: RoundInputs, loaded: LoadedModel, mode: Realign, *, seed: int
+) -> tuple[Priors, Corrections]:
+    """The joint priors as the adaptation takes them, see `realign`, and what was done.
 
     `Realign.CHOOSE` makes the scene from both estimates with the weights that the round starts from, and takes the one whose
     Gaussians show the captured photos with the smaller squared error. Only what the user gave is looked at.
     """
-    state, generator = inputs.state, child_generator(seed, "realign")
-    arguments = (state.priors, inputs.joint_priors, inputs.anchors, state.views.images, inputs.inserted.view.images[0])
+    state, joint, generator = inputs.state, inputs.joint_priors, child_generator(seed, "realign")
+    views = inputs.views
+    arguments = (state.priors, joint, inputs.anchors, views.images[:-1], views.images[-1])
     if mode is not Realign.CHOOSE:
-        return realign(*arguments, mode, generator=generator)[0]
+        priors, report = realign(*arguments, mode, generator=generator)
+        return priors, Corrections(estimate=Estimate.JOINT if priors is joint else Estimate.HELD, refinement=report)
     held, _ = realign(*arguments, Realign.HOLD, generator=generator)
-    views = state.views.append(inputs.inserted.view)
-    errors = [
-        _photo_error(predict(views, priors, loaded, state.weights), views) for priors in (inputs.joint_priors, held)
-    ]
-    return held if errors[1] < errors[0] else inputs.joint_priors
+    if held is joint:
+        return joint, Corrections()
+    photos = ~views.generated
+    placed = photos.clone()
+    placed[:-1] &= posed_in_both(state.priors, joint, len(views) - 1).cpu()
+    compared = placed if bool(placed.any()) else photos
+    joint_error, held_error = (
+        _photo_error(predict(views, priors, loaded, state.weights), views, compared) for priors in (joint, held)
+    )
+    estimate = Estimate.HELD if held_error < joint_error else Estimate.JOINT
+    _log.info("cameras and depths: the %s estimate (errors: joint %.3g, held %.3g)", estimate, joint_error, held_error)
+    corrections = Corrections(estimate=estimate, joint_error=joint_error, held_error=held_error)
+    return (held if estimate is Estimate.HELD else joint), corrections
 
 
-def _photo_error(prediction: Prediction, views: ViewSet) -> float:
-    """Mean squared error of the captured photos against what all Gaussians show there."""
+def _photo_error(prediction: Prediction, views: ViewSet, compared: Bool[Tensor, "view"]) -> float:
+    """Mean squared error of some photos against what all Gaussians show there."""
     if prediction.gaussians is None:
         raise ValueError("a rendered picture needs the Gaussian head")
-    captured = torch.nonzero(~views.generated)[:, 0].tolist()
+    captured = torch.nonzero(compared)[:, 0].tolist()
     poses, intrinsics = prediction.world_from_cam[captured], prediction.intrinsics_px[captured]
     shown = render(prediction.gaussians, poses, intrinsics, views.height, views.width).rgb.clamp(0, 1)
     return float((shown.cpu() - views.images[captured]).square().mean())
@@ -366,5 +478,4 @@ def _device_anchors(anchors: Anchors, loaded: LoadedModel) -> Anchors:
         depth_conf=moved(anchors.depth_conf),
         normals=moved(anchors.normals),
         normals_conf=moved(anchors.normals_conf),
-        gauge_view=anchors.gauge_view,
     )

@@ -53,3 +53,21 @@ def seen_at(
     height, width = content.shape[-2:]
     grid, z, in_frame = project_to_views(points_world, rigid_inverse(world_from_cam), intrinsics_px, height, width)
     return sample_at(content, grid, mode), z, in_frame
+
+
+def warp_maps(
+    maps: Float[Tensor, "channel height width"], grid: Float[Tensor, "height width 2"]
+) -> Float[Tensor, "channel height width"]:
+    """Maps resampled (bilinear) where a grid says, in coordinates of `grid_of_pixels`; outside the frame the border is repeated."""
+    sampled = torch.nn.functional.grid_sample(
+        maps[None], grid[None].to(maps), mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return sampled[0]
+
+
+def warp_known(
+    values: Float[Tensor, "height width"], known: Bool[Tensor, "height width"], grid: Float[Tensor, "height width 2"]
+) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
+    """(a warped map, where it is known): a pixel is known if all that it was made from is."""
+    moved = warp_maps(torch.stack([values, known.to(values)]), grid)
+    return moved[0], moved[1] > 1 - 1e-4

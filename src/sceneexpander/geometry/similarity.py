@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.geometry.rigid import rigid_from_parts
@@ -99,6 +99,38 @@ def align_poses(
         if not scale > 0:
             raise ValueError("align_poses: the camera centres do not determine a positive scale")
     return _as_similarity(scale, rotation, mean_t - scale * rotation @ mean_s, source_from_cam)
+
+
+def align_views(
+    source_from_cam: Float[Tensor, "view 4 4"],
+    source_depth: Float[Tensor, "view height width"],
+    target_from_cam: Float[Tensor, "view 4 4"],
+    target_depth: Float[Tensor, "view height width"],
+    *,
+    posed: Bool[Tensor, "view"] | None = None,
+) -> Similarity:
+    """The similarity between two estimates of the same views: poses as in `align_poses`, the median ratio of depths as scale.
+
+    Unlike distances of cameras, the ratio of depths is determined for one view and steady for short baselines.
+
+    Args:
+        source_from_cam: poses in the source frame.
+        source_depth: depths of the same views; pixels that are not positive in both take no part.
+        target_from_cam: poses in the target frame.
+        target_depth: depths in the target's scale.
+        posed: views whose pose is an estimate on both sides; placeholders take no part, unless there is nothing else.
+
+    Raises:
+        ValueError: no views, or no pixel with a depth on both sides.
+    """
+    if posed is not None and bool(posed.any()):
+        source_from_cam, target_from_cam = source_from_cam[posed], target_from_cam[posed]
+        source_depth, target_depth = source_depth[posed], target_depth[posed]
+    known = (source_depth > 0) & (target_depth > 0)
+    if not bool(known.any()):
+        raise ValueError("align_views: no pixel has a depth on both sides")
+    scale = float((target_depth[known] / source_depth[known]).median())
+    return align_poses(source_from_cam, target_from_cam, scale=scale)
 
 
 def _as_similarity(scale: float, rotation: Tensor, translation: Tensor, like: Tensor) -> Similarity:

@@ -96,8 +96,20 @@ class PreparesInputs(Protocol):
         """A `Measured` of all views, once."""
         ...
 
-    def prepare(self, images: Float[Tensor, "view 3 height width"], measured: Any) -> Any:
-        """The network's input for the views that ``measured`` holds."""
+    def prepare(
+        self,
+        images: Float[Tensor, "view 3 height width"],
+        measured: Any,
+        grids: Sequence[Float[Tensor, "height width 2"] | None] = (),
+    ) -> Any:
+        """The network's input for the views that ``measured`` holds.
+
+        Args:
+            images: their pictures, as they were measured.
+            measured: of the priors.
+            grids: how the first views are warped after that (see `geometry.lookup.warp_maps`; None: not): picture, depth and all that
+                was measured per pixel move together, cameras stay.
+        """
         ...
 
     def predict_prepared(

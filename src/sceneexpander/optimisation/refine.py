@@ -19,29 +19,12 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.geometry.rigid import rigid_inverse
-from sceneexpander.optimisation.config import RatesConfig
+from sceneexpander.optimisation.config import RatesConfig, RefineConfig
 from sceneexpander.optimisation.optimise import photometric_loss, scene_extent
 from sceneexpander.optimisation.splats import Splats
-from sceneexpander.ranges import Rate, Share, Steps, check_ranges
 from sceneexpander.splatting import rasterise
 
 _LAST_RATE = 0.05  # of the first, reached along a cosine
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RefineConfig:
-    """How long and how fast. Rates are Adam's; that of the means is in units of the scene's extent."""
-
-    steps: Steps = 0  # one view each; 0: the Gaussians stay as the model made them
-    means: Rate = 3.2e-4
-    scales: Rate = 1e-2
-    rotations: Rate = 1e-3
-    opacities: Rate = 0.1
-    colours: Rate = 1e-2
-    ssim_weight: Share = 0.2  # of 1 - SSIM beside the mean absolute error
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +58,7 @@ def refine(
     Args:
         start: cameras and Gaussians.
         images: pictures of its views, in order, RGB in [0, 1], at its size.
-        config: settings; without steps the start is returned.
+        config: settings; without visits the start is returned.
         weights: of pixels, in [0, 1]: how much a picture is to be believed there; 1 everywhere by default.
         seed: order of the views.
         device: where to work.
@@ -92,17 +75,18 @@ def refine(
     targets = [
         view for view in start.posed.nonzero()[:, 0].tolist() if weights is None or bool((weights[view] > 0).any())
     ]
-    if config.steps == 0 or not targets or len(start.gaussians) == 0:
+    steps = config.visits * len(targets)
+    if steps == 0 or len(start.gaussians) == 0:
         return start, None
     fit = _Fit(start, images, config, weights, torch.device(device))
     before = fit.mean_loss(targets)
-    for step in range(config.steps):
+    for step in range(steps):
         turn, place = divmod(step, len(targets))
         order = torch.randperm(len(targets), generator=child_generator(seed, f"refine/{turn}"))
-        loss = fit.step(targets[int(order[place])], step / config.steps)
+        loss = fit.step(targets[int(order[place])], step / steps)
         if on_step is not None:
             on_step(step + 1, loss)
-    report = RefineReport(steps=config.steps, before=before, after=fit.mean_loss(targets))
+    report = RefineReport(steps=steps, before=before, after=fit.mean_loss(targets))
     return (replace(start, gaussians=fit.splats.gaussians()) if report.accepted else start), report
 
 

@@ -12,6 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import Scene
@@ -123,7 +124,8 @@ def _write_viewers(source: SceneSource, scene: Scene, folder: Path) -> None:
             if unavailable_in(method.splats) is not None:
                 continue
             splats = PackedSplats.load(method.splats)
-            shown.append(ShownMethod(splats=splats, label=method_words(method.name, splats.model).label))
+            fit = MetricsRow.load(method.metrics).fit
+            shown.append(ShownMethod(splats=splats, label=method_words(method.name, splats.model, fit).label))
         known = {view for method in shown for view in method.splats.cameras.view_ids}
         page = viewer_page(
             scene.name,

@@ -62,12 +62,12 @@ def _scene(facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     methods = []
+    rows = {method["name"]: MetricsRow.load(folder / method["metrics"]) for method in facts["methods"]}
     for method in facts["methods"]:
-        words = method_words(method["name"], method["model"])
+        words = method_words(method["name"], method["model"], rows[method["name"]].fit)
         poster = max(method["stills"], key=lambda still: -abs(still["frame"] - method["inserted_frame"]))["rgb"]
         goal = method["inserted_frame"] / max(method["frames"], 1)
         methods.append({**method, "label": words.label, "short": words.short, "poster": poster, "goal": goal})
-    rows = {method["name"]: MetricsRow.load(folder / method["metrics"]) for method in facts["methods"]}
     curves, steps = objective_curves(facts["series"]), len(facts["series"].get("loss", ()))
     return {
         **{
@@ -117,9 +117,10 @@ def _table(
 
 def _cell(method: str, rows: Mapping[str, MetricsRow], item: Quantity) -> dict[str, Any]:
     value, spread = rows[method].value(item.name), rows[method].spread.get(item.name)
-    # The ceiling of preservation is not a competitor: bold compares the methods that show the new view, as far as the printed
-    # digits go.
-    known = {name: row.value(item.name) for name, row in rows.items() if name != "captured"}
+    # The scene before the insertion is not a competitor, and numbers of fitted Gaussians are none for those of others: bold compares
+    # methods that show the new view and were treated alike, as far as the printed digits go.
+    equals = {name: row for name, row in rows.items() if name != "captured" and row.fit is rows[method].fit}
+    known = {name: row.value(item.name) for name, row in equals.items()}
     rivals = {name: round(v, item.digits + 2 * (item.unit == "%")) for name, v in known.items() if v is not None}
     best = (max if item.better == "higher" else min)(rivals.values(), default=None)
     return {
@@ -236,9 +237,9 @@ def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
                 f"{warmup['steps']} steps, held-out error {warmup['before']:.4f} to {warmup['after']:.4f}, {outcome}",
             )
         )
-    if config["refine"]["steps"]:
-        steps = config["refine"]["steps"]
-        rows.append(("Gaussians", f"in all rows of this reconstructor fitted to their pictures for {steps} steps"))
+    visits = config["refine"]["visits"]
+    if visits:
+        rows.append(("Gaussians", f"fitted to their pictures, {visits} steps per view, in all rows marked + fit"))
     rows.append(
         ("All runs", "make ui opens MLflow with the numbers of this and other runs; its menu Views has the columns")
     )

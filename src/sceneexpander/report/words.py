@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sceneexpander.artifacts.metrics import Fit
 from sceneexpander.artifacts.quantities import GEOMETRY, INSERTION, QUALITY, Quantity
 
 LAYERS = (("rgb", "Colour"), ("depth", "Depth"), ("provenance", "Provenance"))
@@ -22,12 +23,12 @@ METHODS = {
     "captured": MethodWords(
         label="Captured only",
         short="before the insertion",
-        meaning="{model} given the captured photos alone. The ceiling of preservation, and the floor of expansion: nothing new is shown.",
+        meaning="The scene before this insertion: in the first round {model} given the captured photos alone. Nothing new is shown.",
     ),
     "backbone": MethodWords(
         label="{model} + inserted view",
         short="unadapted",
-        meaning="{model} given the captured photos and the inserted picture, with its weights as they were before this round.",
+        meaning="{model} with unadapted weights, given the captured photos and the inserted picture, which counts like a photo.",
     ),
     "gaussian_splatting": MethodWords(
         label="3DGS per scene, from {model}",
@@ -38,12 +39,14 @@ METHODS = {
     "omnivggt": MethodWords(
         label="OmniVGGT, pixel-aligned",
         short="another reconstructor",
-        meaning="OmniVGGT given the same pictures; it has no Gaussians, so every pixel of its depth becomes one by the project's rule.",
+        meaning="OmniVGGT given the same pictures, as they are; it has no Gaussians, so every pixel of its depth becomes one by the "
+        "project's rule.",
     ),
     "ttt3r": MethodWords(
         label="{model}, pixel-aligned",
         short="another reconstructor",
-        meaning="{model} given the same pictures one after the other, the inserted one last; its points become Gaussians by the same rule.",
+        meaning="{model} given the same pictures, as they are, one after the other, the inserted one last; its points become Gaussians by "
+        "the same rule.",
     ),
     "omnivggt_optimised": MethodWords(
         label="OmniVGGT, optimised",
@@ -60,10 +63,18 @@ METHODS = {
         short="adapted, then optimised",
         meaning="SceneExpander's Gaussians fitted further to the same pictures: an addition, not the method.",
     ),
+    "corrected": MethodWords(
+        label="Corrections on {model}, no steps",
+        short="what Algorithm 1 starts from",
+        meaning="What SceneExpander does beyond Algorithm 1, without a step of it: the inserted picture in the photos' colours, cameras "
+        "that may stay as they were, generated Gaussians that fade where photos contradict them and reach each other where nothing else "
+        "is, and a fit that doubts contradicted pixels, each if it is configured. The weights are those that the round starts from.",
+    ),
     "sceneexpander": MethodWords(
         label="SceneExpander on {model}",
-        short="after the adaptation",
-        meaning="The same reconstructor on the same pictures, after its weights were adapted to this scene.",
+        short="corrections and Algorithm 1",
+        meaning="The same corrections, after the weights were adapted to this scene by Algorithm 1. What this row has more than the "
+        "corrections without steps is the adaptation's doing; the rest of its gain is the corrections'.",
     ),
 }
 
@@ -80,9 +91,9 @@ TABLES = (
 )
 
 
-def method_words(name: str, model: str) -> MethodWords:
-    """Words for a method with the reconstructor's name filled in. Unknown methods speak for themselves."""
+def method_words(name: str, model: str, fit: Fit = Fit.PREDICTED) -> MethodWords:
+    """Words for a method with the reconstructor's name filled in and its fit marked. Unknown methods speak for themselves."""
     words = METHODS.get(name, MethodWords(label=name, short="", meaning=""))
     return MethodWords(
-        label=words.label.format(model=model), short=words.short, meaning=words.meaning.format(model=model)
+        label=words.label.format(model=model) + fit.mark, short=words.short, meaning=words.meaning.format(model=model)
     )

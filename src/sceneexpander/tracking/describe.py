@@ -69,7 +69,7 @@ VIEWS = (
     SavedView(
         key="quality",
         name="Quality: photos and inserted view",
-        params=("method",),
+        params=("method", "gaussians"),
         first=(_SHOWN_QUALITY[0], _SHOWN_INSERTION[0]),
         tags=(CAMERAS_TAG,),
         further=(*_SHOWN_QUALITY[1:], *_SHOWN_INSERTION[1:]),
@@ -115,7 +115,10 @@ def experiment_note() -> str:
             "",
             groups,
             "",
-            "`captured` is the ceiling of preservation, `backbone` the reconstructor before the adaptation, `sceneexpander` after it.",
+            "`captured` is the scene before the insertion, `backbone` the unadapted reconstructor with the inserted view, `corrected` "
+            "what we change without a step of adaptation, `sceneexpander` the same with Algorithm 1: the last two differ by what the "
+            "adaptation does.",
+            "Only runs with the same `gaussians` (as predicted, fitted, optimised) can be compared in PSNR, SSIM and ST-LPIPS.",
             f"Views without a camera are in no mean; the tag `{CAMERAS_TAG}` and the file `cameras.txt` of a run name them.",
             "Shares are from 0 to 1.",
             "",
@@ -132,7 +135,10 @@ def run_note(
     prompt: str, method: str, row: MetricsRow | None, cameras: Mapping[str, Any] | None, warnings: Sequence[str]
 ) -> str:
     """The sentence, the method, its result in a line, and everything that is not as it should be: Markdown."""
-    parts = ["> " + " ".join(prompt.split()), METHOD_TITLES.get(method, method) + "."]
+    parts = [
+        "> " + " ".join(prompt.split()),
+        METHOD_TITLES.get(method, method) + ("" if row is None else row.fit.mark) + ".",
+    ]
     if row is not None:
         known = [(item, row.value(item.name)) for item in _HEADLINE]
         parts.append(

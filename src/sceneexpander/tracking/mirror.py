@@ -57,12 +57,13 @@ def _run(
     cameras = _cameras(facts, item, name)
     return RunRecord(
         key=run_key(facts["config"], facts["overrides"], row.numbers(), scene, number, name, row.weights_sha256),
-        name=f"{scene} r{number} {name}" + ("" if variant == "default" else f" [{variant}]"),
+        name=f"{scene} r{number} {name}{row.fit.mark}" + ("" if variant == "default" else f" [{variant}]"),
         params={
             "variant": variant,
             "scene_name": scene,
             "round": str(number),
             "method": name,
+            "gaussians": row.fit.value,
             "reconstructor": row.model,
             "prompt": item["prompt"],
             **flatten(facts["config"]),
@@ -74,6 +75,7 @@ def _run(
             "scene": scene,
             "round": str(number),
             "method": name,
+            "gaussians": row.fit.value,
             "variant": variant,
             "reconstructor": row.model,
             "weights_sha256": row.weights_sha256,

@@ -24,6 +24,7 @@ METHODS = (  # the last one that exists is shown first
     "gaussian_splatting",
     "captured",
     "backbone",
+    "corrected",
     "sceneexpander_optimised",
     "sceneexpander",
 )

@@ -4,13 +4,14 @@ import torch
 from sceneexpander.adaptation.augmentation import (
     Mode,
     _block_weights,
-    augment_view,
     draw_mode,
+    draw_warp,
     identity_grid,
-    sample,
+    random_affine,
     warp_grid,
 )
 from sceneexpander.adaptation.config import AugmentConfig
+from sceneexpander.geometry.lookup import warp_maps
 
 STILL = AugmentConfig(rotation_deg=0, translation=0, scale=0, shear_deg=0)
 
@@ -27,15 +28,12 @@ def test_zero_magnitudes_change_nothing(mode: Mode) -> None:
 
 def test_the_identity_grid_samples_every_pixel_at_its_centre() -> None:
     image = torch.rand(3, 17, 23, generator=_generator())
-    torch.testing.assert_close(sample(image, identity_grid(17, 23)), image, atol=1e-5, rtol=0)
+    torch.testing.assert_close(warp_maps(image, identity_grid(17, 23)), image, atol=1e-5, rtol=0)
 
 
-def test_identity_mode_returns_the_very_same_tensor() -> None:
-    image = torch.rand(3, 8, 8)
+def test_identity_mode_has_no_warp() -> None:
     config = AugmentConfig(identity=1, global_affine=0, blockwise=0, global_and_block=0)
-    moved, grid = augment_view(image, config, _generator())
-    assert moved is image
-    assert grid is None
+    assert draw_warp(config, 8, 8, _generator()) is None
 
 
 def test_modes_come_with_their_probabilities() -> None:
@@ -89,3 +87,34 @@ def test_rotation_is_a_rotation_for_any_aspect() -> None:
 def test_probabilities_must_sum_to_one() -> None:
     with pytest.raises(ValueError, match="sum to 1"):
         AugmentConfig(identity=0.5)
+
+
+def test_blocks_move_as_strongly_as_configured() -> None:
+    def mean_move(strength: float) -> float:
+        config = AugmentConfig(block_strength=strength)
+        moves = [
+            (warp_grid(Mode.BLOCK, config, 60, 80, _generator(seed)) - identity_grid(60, 80)).norm(dim=-1).mean()
+            for seed in range(5)
+        ]
+        return float(torch.stack(moves).mean())
+
+    assert mean_move(1.0) == pytest.approx(2 * mean_move(0.5), rel=0.1)
+    assert mean_move(0.0) < 1e-6
+
+
+def test_every_kind_of_motion_is_in_an_affine_map_as_strongly_as_configured() -> None:
+    limits = {"rotation_deg": 5.0, "translation": 0.05, "scale": 0.1, "shear_deg": 5.0}
+    for kind, limit in limits.items():
+        config = AugmentConfig(**{**dict.fromkeys(limits, 0.0), kind: limit})
+        maps = random_affine(config, 400, 1.0, 1.5, _generator(1))
+        linear, shift = maps[:, :, :2], maps[:, :, 2]
+        off = (linear - torch.eye(2)).abs().amax((1, 2))
+        angle = torch.deg2rad(torch.tensor(limit))
+        # The largest of 400 uniform draws is within a few per cent of the limit.
+        expected = {"rotation_deg": angle.sin(), "scale": torch.tensor(limit).expm1(), "shear_deg": angle.tan()}
+        if kind == "translation":
+            assert float(off.max()) < 1e-6
+            assert shift.abs().amax(0).tolist() == pytest.approx([2 * limit * 1.5, 2 * limit], rel=0.03)
+        else:
+            assert float(off.max()) == pytest.approx(float(expected[kind]), rel=0.04)
+            assert float(shift.abs().max()) == 0

@@ -11,8 +11,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.inference.config import RivalConfig, RivalsConfig
 from sceneexpander.ingest import IngestConfig
-from sceneexpander.optimisation.config import OptimiseConfig
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import OptimiseConfig, RefineConfig
 from sceneexpander.rendering import RenderConfig
 
 CONF = Path(__file__).parents[3] / "conf"

@@ -78,6 +78,13 @@ def filled(path: str) -> str:
         ),
         ("adapt", [layout.state("S", 2), layout.statistics("adapt", "S", 2)]),
         (
+            "correct",
+            [
+                layout.reconstruction("S", 2, layout.CORRECTED).parent,
+                layout.statistics("correct", "S", 2, layout.CORRECTED),
+            ],
+        ),
+        (
             "rival",
             [layout.reconstruction("S", 2, "backbone").parent, layout.statistics("rival", "S", 2, "backbone")],
         ),

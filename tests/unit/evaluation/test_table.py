@@ -7,7 +7,7 @@ import io
 
 import pytest
 
-from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics, UnavailableRow
+from sceneexpander.artifacts.metrics import Fit, MetricsRow, TruthMetrics, UnavailableRow
 from sceneexpander.evaluation import comparison_table, scene_table
 from sceneexpander.evaluation.repeats import over_repeats
 
@@ -39,19 +39,37 @@ def test_shape_and_means() -> None:
     rows = [
         row("b", "sceneexpander", 22.0, inserted_psnr_db=18.0, navigation_coverage=0.9),
         row("a", "sceneexpander", 20.0, inserted_psnr_db=17.0, navigation_coverage=0.8),
-        row("a", "captured", 25.0, navigation_coverage=0.5),
-        row("b", "captured", 26.0, navigation_coverage=0.7),
-        row("a", "backbone", 18.0, inserted_psnr_db=19.0, navigation_coverage=0.8),
+        row("a", "captured", 25.0, navigation_coverage=0.5, fit=Fit.FITTED),
+        row("b", "captured", 26.0, navigation_coverage=0.7, fit=Fit.FITTED),
+        row("a", "backbone", 18.0, inserted_psnr_db=19.0, navigation_coverage=0.8, fit=Fit.FITTED),
         row("b", "backbone", 19.0, inserted_psnr_db=19.0, navigation_coverage=0.8),
     ]
     header, *lines = cells(comparison_table(rows).csv())
     assert header == [
-        "method", "cells of 2", "PSNR ↑", "SSIM ↑", "insertion PSNR ↑", "coverage ↑", "coverage gained ↑"
+        "method", "Gaussians", "cells of 2", "PSNR ↑", "SSIM ↑", "insertion PSNR ↑", "coverage ↑", "coverage gained ↑"
     ]  # fmt: skip
     assert lines == [
-        ["captured only (ceiling of preservation)", "2", "25.50", "0.500", "–", "0.600", "–"],
-        ["backbone with the inserted view, unadapted", "2", "18.50", "0.500", "19.00", "0.800", "0.200"],
-        ["SceneExpander", "2", "21.00", "0.500", "17.50", "0.850", "0.250"],
+        ["before the insertion, captured photos only", "fitted", "2", "25.50", "0.500", "–", "0.600", "–"],
+        [
+            "backbone with the inserted view, unadapted",
+            "fitted, as predicted",
+            "2",
+            "18.50",
+            "0.500",
+            "19.00",
+            "0.800",
+            "0.200",
+        ],
+        [
+            "SceneExpander (corrections and Algorithm 1)",
+            "as predicted",
+            "2",
+            "21.00",
+            "0.500",
+            "17.50",
+            "0.850",
+            "0.250",
+        ],
     ]
 
 
@@ -60,14 +78,14 @@ def test_a_method_that_could_not_be_run_has_its_reason_in_the_line() -> None:
     lost = UnavailableRow(scene="a", round=1, method="ttt3r", model="ttt3r", seed=0, reason=reason)
     rows = [row("a", "captured", 25.0), row("b", "captured", 15.0), lost, row("b", "omnivggt", 12.0)]
     header, *lines = cells(comparison_table(rows).csv())
-    assert header == ["method", "cells of 2", "PSNR ↑", "SSIM ↑"]
+    assert header == ["method", "Gaussians", "cells of 2", "PSNR ↑", "SSIM ↑"]
     assert lines[1:] == [
-        ["OmniVGGT (pixel-aligned Gaussians)", "1", "12.00 (1/2)", "0.500 (1/2)"],
-        ["TTT3R (pixel-aligned Gaussians)", "0", reason, "–"],
+        ["OmniVGGT (pixel-aligned Gaussians)", "as predicted", "1", "12.00 (1/2)", "0.500 (1/2)"],
+        ["TTT3R (pixel-aligned Gaussians)", "–", "0", reason, "–"],
     ]
     per_scene = cells(scene_table(rows).csv())
-    assert ["a", "1", "0", "TTT3R (pixel-aligned Gaussians)", reason, "–"] in per_scene
-    assert ["b", "1", "0", "TTT3R (pixel-aligned Gaussians)", "missing", "missing"] in per_scene
+    assert ["a", "1", "0", "TTT3R (pixel-aligned Gaussians)", "–", reason, "–"] in per_scene
+    assert ["b", "1", "0", "TTT3R (pixel-aligned Gaussians)", "–", "missing", "missing"] in per_scene
     with pytest.raises(ValueError, match="two rows"):
         comparison_table([lost, lost])
 
@@ -86,7 +104,7 @@ def test_repeats_become_a_mean_with_its_spread() -> None:
     assert whole.inserted_psnr_db is None, "one run lacks it"
     assert "inserted_psnr_db" not in whole.spread
     assert whole.numbers()["spread_psnr_db"] == pytest.approx(2**0.5)
-    assert cells(comparison_table([whole]).csv())[1][2] == "21.00 ± 1.41"
+    assert cells(comparison_table([whole]).csv())[1][3] == "21.00 ± 1.41"
     assert over_repeats(runs[:1]) is runs[0]
     with pytest.raises(ValueError, match="one scene"):
         over_repeats([runs[0], row("b", "gaussian_splatting", 1.0)])
@@ -101,9 +119,9 @@ def test_gaps_are_shown_not_averaged_over() -> None:
     ]
     header, *lines = cells(comparison_table(rows).csv())
     table = {line[0].split()[0]: dict(zip(header, line, strict=True)) for line in lines}
-    assert table["captured"]["PSNR ↑"] == "20.00 (2/3)"
-    assert table["captured"]["coverage ↑"] == "0.500 (1/3)"
-    assert table["captured"]["depth AbsRel ↓"] == "missing"
+    assert table["before"]["PSNR ↑"] == "20.00 (2/3)"
+    assert table["before"]["coverage ↑"] == "0.500 (1/3)"
+    assert table["before"]["depth AbsRel ↓"] == "missing"
     assert table["SceneExpander"]["cells of 3"] == "1"
     assert table["SceneExpander"]["depth AbsRel ↓"] == "0.100 (1/3)"
     assert table["backbone"]["coverage gained ↑"] == "missing"  # nothing to compare with in scene c
@@ -114,22 +132,26 @@ def test_scene_table_lists_absent_combinations() -> None:
     rows = [row("a", "captured", 25.0), row("b", "sceneexpander", 20.0)]
     _, *lines = cells(scene_table(rows).csv())
     assert [line[0] for line in lines] == ["a", "a", "b", "b"]
-    assert [line[4] for line in lines] == ["25.00", "missing", "missing", "20.00"]
+    assert [line[5] for line in lines] == ["25.00", "missing", "missing", "20.00"]
 
 
 def test_seeds_and_rounds_are_cells_of_their_own() -> None:
     rows = [row("a", "captured", 20.0), row("a", "captured", 30.0, seed=1), row("a", "captured", 10.0, round=2)]
-    assert cells(comparison_table(rows).csv())[1][1:3] == ["3", "20.00"]
+    assert cells(comparison_table(rows).csv())[1][2:4] == ["3", "20.00"]
     with pytest.raises(ValueError, match="two rows"):
         comparison_table([*rows, rows[0]])
 
 
 def test_unknown_methods_come_last() -> None:
     rows = [row("a", "zebra", 1.0), row("a", "other", 2.0), row("a", "sceneexpander", 3.0)]
-    assert [line[0] for line in cells(comparison_table(rows).csv())[1:]] == ["SceneExpander", "other", "zebra"]
+    assert [line[0] for line in cells(comparison_table(rows).csv())[1:]] == [
+        "SceneExpander (corrections and Algorithm 1)",
+        "other",
+        "zebra",
+    ]
 
 
 def test_markdown() -> None:
     text = comparison_table([row("a", "odd|name", 25.0)]).markdown().splitlines()
-    assert text[1].startswith("| :-- | --: |")
-    assert text[2].startswith("| odd\\|name | 1 | 25.00 |")
+    assert text[1].startswith("| :-- | --: | --: |")
+    assert text[2].startswith("| odd\\|name | as predicted | 1 | 25.00 |")

@@ -12,7 +12,7 @@ from sceneexpander.expandbench import run as bench
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings, run
 from sceneexpander.expansion import ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 from tests.unit.expandbench.test_table import NUMBERS
 
 PLAN = Plan(
@@ -28,7 +28,9 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     """The cells that were really measured; measuring itself is replaced, the cache is not."""
     calls: list[tuple[str, ...]] = []
 
-    def fake(self: bench._Worker, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult:
+    def fake(
+        self: bench._Worker, grade: str, row: str, seed: int, config: AdaptConfig | None, checkpoints: Path
+    ) -> CellResult:
         calls.append((self.name, grade, row, str(seed)))
         alone = None if config is None else NUMBERS
         return CellResult(
@@ -48,7 +50,7 @@ def settings(folder: Path, **changes: object) -> Settings:
 def test_every_cell_once(tmp_path: Path, measured: list[tuple[str, ...]]) -> None:
     seen: list[CellResult] = []
     cells = run(PLAN, settings(tmp_path), on_cell=seen.append)
-    assert len(cells) == len(PLAN) == len(measured) == 2 * (1 + 2 * (1 + 4))
+    assert len(cells) == len(PLAN) == len(measured) == 2 * 2 * (1 + 2 * (1 + 2))
     assert seen == cells
     assert {cell.row for cell in cells} == {CAPTURED, BASELINE, "full", "anchor"}
     again = run(PLAN, settings(tmp_path))
@@ -80,7 +82,7 @@ def test_other_code_or_settings_are_measured_again(tmp_path: Path, measured: lis
     assert len(measured) == 2 * count
     run(PLAN, settings(tmp_path, code="two", warmup=WarmupConfig(steps=1)))
     assert len(measured) == 3 * count
-    run(PLAN, settings(tmp_path, code="two", refine=RefineConfig(steps=1)))
+    run(PLAN, settings(tmp_path, code="two", refine=RefineConfig(visits=1)))
     assert len(measured) == 4 * count
 
 

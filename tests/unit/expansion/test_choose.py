@@ -49,7 +49,7 @@ def test_the_estimate_that_shows_the_photos_better_is_taken(world: tuple[Priors,
         )
         inserted = InsertedView(round=1, view=view_set(images[VIEWS:], generated=True), chosen=0, provenance=(source,))
         inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=joint)
-        return realigned_priors(inputs, loaded, Realign.CHOOSE, seed=0)
+        return realigned_priors(inputs, loaded, Realign.CHOOSE, seed=0)[0]
 
     kept = taken(captured=true, joint=wrong)
     assert kept.depth is not None

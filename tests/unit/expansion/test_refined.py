@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sceneexpander.expansion.rounds import refined
-from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.optimisation.config import RefineConfig
 from tests.unit.evaluation.made import own_pictures
 from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
 
@@ -21,6 +21,6 @@ def test_bars_teach_nothing(doubt: bool) -> None:
     shown = []
     for mask in (valid, None):
         views = replace(VIEWS, images=misleading, valid=mask)
-        result, _ = refined(spoiled(), views, RefineConfig(steps=30), doubt_generated=doubt, seed=0)
+        result, _ = refined(spoiled(), views, RefineConfig(visits=10), doubt_generated=doubt, seed=0)
         shown.append(float(own_pictures(result).images[:2, :, : height - 8].mean()))
     assert shown[0] > shown[1] + 0.03

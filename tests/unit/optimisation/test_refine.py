@@ -9,12 +9,13 @@ import torch
 
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.image import psnr
+from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.optimisation.optimise import photometric_loss
-from sceneexpander.optimisation.refine import RefineConfig, refine
+from sceneexpander.optimisation.refine import refine
 from sceneexpander.splatting import render
 from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
 
-CONFIG = RefineConfig(steps=60, colours=0.1)  # fast colours: the start is grey
+CONFIG = RefineConfig(visits=20, colours=0.1)  # fast colours: the start is grey
 IMAGES = VIEWS.images
 
 
@@ -41,21 +42,30 @@ def test_every_picture_gets_better_and_only_the_gaussians_change() -> None:
 
 
 def test_same_seed_same_bits() -> None:
-    one, _ = refine(spoiled(), IMAGES, replace(CONFIG, steps=5), seed=1)
-    two, _ = refine(spoiled(), IMAGES, replace(CONFIG, steps=5), seed=1)
-    other, _ = refine(spoiled(), IMAGES, replace(CONFIG, steps=5), seed=2)
+    one, _ = refine(spoiled(), IMAGES, replace(CONFIG, visits=2), seed=1)
+    two, _ = refine(spoiled(), IMAGES, replace(CONFIG, visits=2), seed=1)
+    other, _ = refine(spoiled(), IMAGES, replace(CONFIG, visits=2), seed=2)
     assert torch.equal(one.gaussians.sh, two.gaussians.sh)
     assert torch.equal(one.gaussians.means, two.gaussians.means)
     assert not torch.equal(one.gaussians.sh, other.gaussians.sh)
 
 
-def test_without_steps_it_is_the_start_itself() -> None:
+def test_every_view_gets_its_visits_however_many_there_are() -> None:
+    posed = TRUTH.posed.clone()
+    posed[2] = False
+    for start in (spoiled(), replace(spoiled(), posed=posed)):
+        _, report = refine(start, IMAGES, replace(CONFIG, visits=3), seed=0)
+        assert report is not None
+        assert report.steps == 3 * int(start.posed.sum())
+
+
+def test_without_visits_it_is_the_start_itself() -> None:
     start = spoiled()
     assert refine(start, IMAGES, RefineConfig(), seed=0) == (start, None)
 
 
 def test_what_makes_it_worse_is_taken_back() -> None:
-    wild = RefineConfig(steps=3, means=100.0, scales=5.0)
+    wild = RefineConfig(visits=1, means=100.0, scales=5.0)
     result, report = refine(TRUTH, IMAGES, wild, seed=0)
     assert report is not None
     assert not report.accepted
@@ -87,8 +97,8 @@ def test_weights_of_one_are_no_weights_and_half_of_them_half_the_loss() -> None:
 
 
 def test_bad_settings_are_named() -> None:
-    with pytest.raises(UserError, match="steps"):
-        RefineConfig(steps=-1)
+    with pytest.raises(UserError, match="visits"):
+        RefineConfig(visits=-1)
     with pytest.raises(UserError, match="colours"):
         RefineConfig(colours=-1.0)
     with pytest.raises(ValueError, match="do not fit"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,7 +15,7 @@ from PIL import Image
 from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.adaptation.observe import Look
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
-from sceneexpander.artifacts.metrics import MetricsRow, UnavailableRow
+from sceneexpander.artifacts.metrics import Fit, MetricsRow, UnavailableRow
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
@@ -169,7 +170,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
             "device": "cpu",
             "model": {"weights": "builtin"},
             "adapt": {"steps": 3},
-            "refine": {"steps": 2},
+            "refine": {"visits": 2},
         },
         overrides=["profile=smoke"],
     )
@@ -232,7 +233,7 @@ def test_it_says_what_rows_and_columns_mean_and_what_went_wrong(page: Path) -> N
     html = page.read_text()
     assert "SceneExpander on mini" in html
     assert "WorldMirror" not in html
-    assert "ceiling of preservation" in html
+    assert "ceiling" not in html, "fitted Gaussians show the photos better than the scene before the insertion"
     shown = [item for _, table in TABLES for item in table if item.name in {"psnr_db", "ssim", "inserted_psnr_db"}]
     assert len(shown) == 3
     for item in shown:
@@ -261,7 +262,30 @@ def test_bold_compares_methods_with_the_inserted_view(page: Path) -> None:
     table = page.read_text().split("<tbody>")[1].split("</tbody>")[0]
     bold = re.findall(r'<td class="best"[^>]*><span>([^<]+)<', table)
     assert "22.00" in bold
-    assert "20.00" not in bold, "captured only is a ceiling, not a competitor"
+    assert "20.00" not in bold, "the scene before the insertion is no competitor"
+
+
+def test_bold_and_names_tell_fitted_rows_from_others(gathered: Path, tmp_path: Path) -> None:
+    """A method whose Gaussians were fitted wins nothing over one whose were not, and says what it is."""
+    folder = tmp_path / "room"
+    shutil.copytree(gathered, folder)
+    for name, value, fit in (("backbone", 21.0, Fit.PREDICTED), ("sceneexpander", 27.0, Fit.FITTED)):
+        path = folder / "round_1" / name / "metrics.json"
+        replace(MetricsRow.load(path), psnr_db=value, fit=fit).save(path)
+    (tmp_path / "report").mkdir()
+    write_page([folder], tmp_path / "report")
+    html = (tmp_path / "report" / "index.html").read_text()
+    table = html.split("<tbody>")[1].split("</tbody>")[0]
+    assert ">27.00<" in table
+    assert 'class="best"' not in table
+    names = re.findall(r'<th scope="row">([^<]*)</th>', table)
+    assert [name.endswith("+ fit") for name in names[:3]] == [False, False, True]
+    runs = {run.tags["method"]: run for run in scene_runs(folder, commit="abc")}
+    assert runs["sceneexpander"].name.startswith("room r1 sceneexpander + fit")
+    assert "+ fit" not in runs["backbone"].name
+    assert runs["sceneexpander"].params["gaussians"] == "fitted"
+    assert runs["backbone"].params["gaussians"] == "as predicted"
+    assert "+ fit." in runs["sceneexpander"].tags["mlflow.note.content"]
 
 
 def looks_of(page: Path) -> list[str]:

@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.camera import pixel_centres, resize_intrinsics
 from sceneexpander.geometry.gauge import poses_relative_to
+from sceneexpander.geometry.lookup import grid_of_pixels, warp_known, warp_maps
 from sceneexpander.geometry.normals import normals_from_depth, viewing_rays
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.models.mini.config import OUTPUT_STRIDE, PATCH_PX, MiniConfig
@@ -78,6 +79,45 @@ class PreparedViews:
     priors: MeasuredPriors
     scale: float  # median base depth of these views
     working: WorkingViews
+
+
+def _warped_views(priors: MeasuredPriors, grids: Sequence[Float[Tensor, "height width 2"] | None]) -> MeasuredPriors:
+    """What was measured of views whose pictures are warped: all that belongs to a pixel's content moves with it, rays stay."""
+    names = ("depth", "confident", "log_depth_fine", "confident_fine", "coarse", "base_normals")
+    moved = {name: getattr(priors, name).clone() for name in names}
+    known = None if priors.known is None else priors.known.clone()
+    evidence = len(EVIDENCE_CHANNELS)
+    for view, grid in enumerate(grids):
+        if grid is None:
+            continue
+        fine, half = (_resized_grid(grid, moved[name].shape[-2:]) for name in ("log_depth_fine", "coarse"))
+        for name, own in (("depth", grid), ("confident", grid), ("log_depth_fine", fine), ("confident_fine", fine)):
+            moved[name][view] = warp_maps(moved[name][view][None], own)[0]
+        if known is not None:
+            known[view] = warp_known(priors.depth[view], priors.known[view], grid)[1]  # type: ignore[index]
+        moved["coarse"][view, :evidence] = warp_maps(priors.coarse[view, :evidence], half)
+        # The normals of the surface that the depth has now, as they would be measured; rays are the camera's, and stay.
+        rows, columns = half.shape[:2]
+        height, width = priors.depth.shape[-2:]
+        intrinsics = resize_intrinsics(priors.intrinsics_px[view][None], columns / width, rows / height)
+        log_depth = functional.avg_pool2d(moved["log_depth_fine"][view][None, None], OUTPUT_STRIDE)[:, 0]
+        normals = normals_from_depth((log_depth - log_depth.median()).exp(), intrinsics)[0]
+        moved["base_normals"][view] = normals
+        moved["coarse"][view, evidence : evidence + 3] = normals.movedim(-1, 0)
+    return replace(priors, **moved, known=known)
+
+
+def _resized_grid(grid: Float[Tensor, "height width 2"], size: Sequence[int]) -> Float[Tensor, "rows columns 2"]:
+    """The same warp for maps of another size: its displacements, which are in shares of the frame."""
+    own = _centres(*grid.shape[:2], like=grid)
+    offset = functional.interpolate(
+        (grid - own).movedim(-1, 0)[None], size=tuple(size), mode="bilinear", antialias=True
+    )
+    return _centres(size[0], size[1], like=grid) + offset[0].movedim(0, -1)
+
+
+def _centres(height: int, width: int, *, like: Tensor) -> Float[Tensor, "height width 2"]:
+    return grid_of_pixels(pixel_centres(height, width, like=like), height, width)
 
 
 def _whole(priors: Priors | None, views: int, height: int, width: int) -> dict[str, Tensor]:
@@ -152,14 +192,30 @@ def measure(priors: Priors | None, views: int, height: int, width: int, config: 
     )
 
 
-def prepare(images: Float[Tensor, "view 3 height width"], priors: MeasuredPriors, config: MiniConfig) -> PreparedViews:
-    """Everything the network reads, at its working resolution and in the scale of these views."""
-    depth = priors.depth if priors.known is None else priors.depth[priors.known]
-    scale = depth.median() if depth.numel() else priors.depth.median()
-    rgb = _resample(images, (priors.log_depth_fine.shape[-2], priors.log_depth_fine.shape[-1]))
+def prepare(
+    images: Float[Tensor, "view 3 height width"],
+    priors: MeasuredPriors,
+    config: MiniConfig,
+    grids: Sequence[Float[Tensor, "height width 2"] | None] = (),
+) -> PreparedViews:
+    """Everything the network reads, at its working resolution and in the scale of these views.
+
+    With ``grids``, views are warped after they were measured and compared with one another, see `PreparesInputs.prepare`.
+    """
+    size = (priors.log_depth_fine.shape[-2], priors.log_depth_fine.shape[-1])
+    rgb = _resample(images, size)
     crossed = priors.pairs.compare(
         functional.avg_pool2d(rgb, OUTPUT_STRIDE), priors.views, most_views=config.cross_views
     )
+    if any(grid is not None for grid in grids):
+        priors, images = _warped_views(priors, grids), images.clone()
+    for view, grid in enumerate(grids):
+        if grid is not None:
+            images[view] = warp_maps(images[view], grid)
+            rgb[view] = _resample(images[view][None], size)[0]
+            crossed[view] = warp_maps(crossed[view], _resized_grid(grid, crossed.shape[-2:]))
+    depth = priors.depth if priors.known is None else priors.depth[priors.known]
+    scale = depth.median() if depth.numel() else priors.depth.median()
     log_base = priors.log_depth_fine - scale.log()
     fine = torch.cat(
         [(rgb - 0.5) * 4, log_base[:, None], ((priors.confident_fine - 0.5) * 2)[:, None]],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -74,9 +75,14 @@ class Mini(nn.Module):
         return measure(priors, views, height, width, self.config)
 
     @torch.no_grad()
-    def prepare(self, images: Float[Tensor, "view 3 height width"], measured: MeasuredPriors) -> PreparedViews:
+    def prepare(
+        self,
+        images: Float[Tensor, "view 3 height width"],
+        measured: MeasuredPriors,
+        grids: Sequence[Float[Tensor, "height width 2"] | None] = (),
+    ) -> PreparedViews:
         """See `PreparesInputs.prepare`."""
-        return prepare(images, measured, self.config)
+        return prepare(images, measured, self.config, grids)
 
     def predict_prepared(
         self,

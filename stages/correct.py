@@ -1,0 +1,57 @@
+"""correct: the round without a step. All that is ours beyond the paper, on the weights that the round starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.artifacts.anchors import Anchors
+from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.state import ExpansionState, load_priors
+from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.config.files import read_sections
+from sceneexpander.expansion import ModelConfig, RoundInputs, correct_round, load_model, refined_round
+from sceneexpander.optimisation.config import RefineConfig
+from stages import layout
+from stages.runner import Cell, left_out, stage, use_threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sections:
+    """What this stage reads of the configuration."""
+
+    seed: int
+    device: str
+    threads: int
+    model: ModelConfig
+    adapt: AdaptConfig
+    refine: RefineConfig
+
+
+@stage("scene", "round", "previous", "method")
+def main(cell: Cell) -> None:
+    """Cameras, colour, trust and closed gaps as `adapt` has them, and the same fit, without its steps."""
+    if left_out(cell):
+        return
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_threads(sections.threads)
+    inputs = RoundInputs(
+        state=ExpansionState.load(layout.state(cell.scene, cell.previous)),
+        inserted=InsertedView.load(layout.inserted(cell.scene, cell.round)),
+        anchors=Anchors.load(layout.anchors(cell.scene, cell.round)),
+        joint_priors=load_priors(layout.joint_priors(cell.scene, cell.round)),
+    )
+    loaded = load_model(sections.model, sections.device)
+    state, reconstruction, corrections = correct_round(inputs, loaded, sections.adapt, seed=sections.seed)
+    reconstruction, fit = refined_round(
+        reconstruction, state, sections.adapt, sections.refine, seed=sections.seed, device=sections.device
+    )
+    with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
+        reconstruction.save(folder / "reconstruction")
+        write_json_atomic(folder / "corrections.json", corrections)
+        if fit is not None:
+            write_json_atomic(folder / layout.REFINEMENT, fit)
+
+
+if __name__ == "__main__":
+    main()
