@@ -202,8 +202,8 @@ def _lens_sigma_deg(
     fit, best = _own_fit(mapping, view, others)
     worst = 0.0
     for parameter in parameters:
-        ends = [_end_of(fit, best, parameter, sign) for sign in (-1.0, 1.0)]
-        worst = max(worst, float(np.median(direction_changes_deg(*ends, others))) / 2)
+        low, high = (_end_of(fit, best, parameter, sign) for sign in (-1.0, 1.0))
+        worst = max(worst, float(np.median(direction_changes_deg(low, high, others))) / 2)
     return worst
 
 
