@@ -181,7 +181,8 @@ def powerless(rows: Mapping[str, AdaptConfig]) -> dict[str, str]:
 
 
 def _sections(study: Study, measured: Measured) -> list[str]:
-    cells, rows = measured.cells, measured.rows
+    cells = measured.cells
+    rows = {row: measured.rows[row] for row in study.rows if row in measured.rows}  # a file's keys are sorted
     if len(study.grades) > 2:
         names = [row for row in (CORRECTED, DEFAULT) if row in rows]
         curves = [

@@ -117,6 +117,10 @@ def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
     assert found.mean == pytest.approx(0.0)
     assert found.lowest == pytest.approx(0.01)
     assert found.better == 1
+    smaller = [replace(c, numbers=replace(c.numbers, depth_abs_rel=0.03)) if c.row == "full" else c for c in CELLS]
+    found = paired(smaller, "full", DEPTH)
+    assert found is not None
+    assert (found.better, found.scenes) == (2, 2)
 
 
 def test_the_tables_say_so() -> None:
