@@ -62,6 +62,7 @@ def optimise_from(cell: Cell, start: str) -> None:
                 reconstruction,
                 views.images,
                 config,
+                photos=views.photos,
                 valid=views.valid,
                 method=cell.method,
                 seed=sections.seed + repeat,

@@ -31,7 +31,7 @@ from tests.support.tiny_model import tiny_images
 pytestmark = pytest.mark.pipeline
 
 ROOT = Path(__file__).parents[2]
-HEIGHT, WIDTH = 96, 128
+HEIGHT, WIDTH = SIZE = 96, 128
 BACKGROUND = 0.08
 READY = "document.documentElement.dataset.state === 'ready'"
 REDRAWN = "Number(document.documentElement.dataset.drawn) >= 2"
@@ -83,16 +83,22 @@ def room(method: str, *, seed: int = 0, scale: float = 1.0) -> Reconstruction:
     )
 
 
-BEFORE, AFTER = room("backbone", seed=5, scale=1.3), room("sceneexpander")
+def compensated(scene: Reconstruction) -> Reconstruction:
+    """The same scene for rasterisers that compensate opacities for the screen blur: another picture altogether."""
+    return replace(scene, gaussians=replace(scene.gaussians, antialiased=True))
 
 
-def ours(scene: Reconstruction, view: int, *, tinted: bool = False) -> Tensor:
+BEFORE, AFTER = room("backbone", seed=5, scale=1.3), compensated(room("sceneexpander"))
+
+
+def ours(
+    scene: Reconstruction, view: int, *, tinted: bool = False, lens: Tensor | None = None, size: tuple[int, int] = SIZE
+) -> Tensor:
     seen = render(
         scene.gaussians,
         scene.world_from_cam[view : view + 1],
-        scene.intrinsics_px[view : view + 1],
-        HEIGHT,
-        WIDTH,
+        scene.intrinsics_px[view : view + 1] if lens is None else lens[None],
+        *size,
         background=torch.full((3,), BACKGROUND),
     )
     rgb = seen.rgb[0].clamp(0, 1)
@@ -114,7 +120,7 @@ def html(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "viewer.html"
     shown = [ShownMethod(splats=pack_splats(item), label=item.method) for item in (BEFORE, AFTER)]
     pictures = dict(zip(AFTER.view_ids, tiny_images(4), strict=True))
-    path.write_text(viewer_page("room", "A wall.", shown, pictures))
+    path.write_text(viewer_page("room", "A wall.", shown, pictures, background=BACKGROUND))
     return path
 
 
@@ -133,6 +139,18 @@ def test_the_page_shows_what_we_render(tab: Page, html: Path, scene: Reconstruct
     assert psnr(shot, wanted) > 35
     assert psnr(wanted.roll(1, 2), wanted) < 30
     assert psnr(shot, other) < 30
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 400), (390, 844)], ids=["desk", "phone"])
+def test_a_window_of_any_size_shows_the_whole_view(tab: Page, html: Path, width: int, height: int) -> None:
+    tab.open(f"file://{html}#view=v0&frusta=0&bare=1", width, height)
+    tab.wait(f"{READY} && {REDRAWN}")
+    # The view fits: as large as the window allows, in its middle, and what lies beside it is drawn as well.
+    scale = min(width / WIDTH, height / HEIGHT)
+    lens = AFTER.intrinsics_px[0] * torch.tensor([scale, scale, 1.0])[:, None]
+    lens[0, 2] += (width - scale * WIDTH) / 2
+    lens[1, 2] += (height - scale * HEIGHT) / 2
+    assert psnr(tab.screenshot(), ours(AFTER, 0, lens=lens, size=(height, width))) > 33
 
 
 def test_the_page_asks_nobody_and_complains_about_nothing(tab: Page, html: Path, tmp_path: Path) -> None:

@@ -32,6 +32,24 @@ class Fit(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SizeMetrics:
+    """What a camera sees of the reconstruction when its picture is drawn at another size than the stored one, against the photo.
+
+    ``open_share`` is the share of pixels that show something in the photo and where the reconstruction's alpha is below 0.9: one looks
+    through it. The others compare with the photo brought to that size; None where it has not that many pixels.
+    """
+
+    open_share: float
+    psnr_db: float | None = None
+    ssim: float | None = None
+    st_lpips: float | None = None
+
+
+PARTS = ("truth", "own", "half", "double", "quadruple", "inserted_own")  # fields of `MetricsRow` that hold numbers
+SIZES = ("own", "half", "double", "quadruple")  # fields of `ViewMetrics` and `MetricsRow`
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ViewMetrics:
     """What one view's camera sees of the reconstruction, against that view's picture. None: not defined there.
 
@@ -40,7 +58,8 @@ class ViewMetrics:
     depth is the rendered one). The ``others_`` columns use
     only Gaussians that came from *other* views, over the pixels that those cover (share ``others_coverage``): a picture that agrees with
     its neighbours scores high, doubled contours (ghosting) score low. ``generated_share`` is the part of alpha that Gaussians
-    of generated views contribute. ``st_lpips`` is the shift-tolerant perceptual distance, smaller is better.
+    of generated views contribute. ``st_lpips`` is the shift-tolerant perceptual distance, smaller is better. All of these are at the stored
+    size; ``own`` is at the photo's own resolution, the others at multiples of the stored size (of captured views only).
     """
 
     view_id: str
@@ -54,6 +73,10 @@ class ViewMetrics:
     others_coverage: float | None = None
     others_psnr_db: float | None = None
     st_lpips: float | None = None
+    own: SizeMetrics | None = None
+    half: SizeMetrics | None = None
+    double: SizeMetrics | None = None
+    quadruple: SizeMetrics | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,8 +109,10 @@ class MetricsRow:
     A view without a pose stands at a placeholder and shows little but its own Gaussians: it is in ``views`` and in no mean, and without
     a pose of the inserted view there are no ``inserted_`` numbers. ``captured_views_posed`` is the count behind the means; 0 means that
     no captured view has a pose, and then the means are over all of them.
-    ``navigation_coverage`` is the mean share of covered pixels over the frames of the navigation. Unless ``fit`` says as predicted,
-    the numbers at the method's own cameras are those of pictures that its Gaussians were fitted to.
+    ``own``, ``half``, ``double`` and ``quadruple`` are the captured views at other sizes than the stored one, see `ViewMetrics`, and
+    ``inserted_own`` the inserted view at its picture's own. ``navigation_coverage`` is the mean share of covered pixels over the frames
+    of the navigation. Unless ``fit`` says as predicted, the numbers at the method's own cameras are those of pictures that its Gaussians
+    were fitted to.
     """
 
     scene: str
@@ -114,6 +139,11 @@ class MetricsRow:
     navigation_coverage: float | None = None
     navigation_frames: int = 0
     truth: TruthMetrics | None = None
+    own: SizeMetrics | None = None
+    half: SizeMetrics | None = None
+    double: SizeMetrics | None = None
+    quadruple: SizeMetrics | None = None
+    inserted_own: SizeMetrics | None = None
     captured_views_posed: int | None = None
     fit: Fit = Fit.PREDICTED
     repeats: int = 1
@@ -122,7 +152,8 @@ class MetricsRow:
     versions: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for item in (self, self.truth, *self.views):
+        nested = [getattr(holder, name) for holder in (self, *self.views) for name in SIZES]
+        for item in (self, self.truth, self.inserted_own, *self.views, *nested):
             if item is None:
                 continue
             for f in fields(item):
@@ -131,18 +162,17 @@ class MetricsRow:
                     raise ValueError(f"{type(item).__name__}.{f.name} is {value}; leave out what is not known")
 
     def value(self, name: str) -> float | None:
-        """A number by name; names of truth metrics start with ``truth.``."""
-        head, _, tail = name.partition(".")
-        holder: Any = self
-        if head == "truth":
-            holder, head = self.truth, tail
-        number = None if holder is None else getattr(holder, head)
-        return None if number is None else float(number)
+        """A number by name; one of a part has the part's name before it, e.g. ``truth.camera_ate`` or ``own.psnr_db``."""
+        found: Any = self
+        for part in name.split("."):
+            found = None if found is None else getattr(found, part)
+        return None if found is None else float(found)
 
     def numbers(self) -> dict[str, float]:
-        """All known numbers by flat name (truth metrics as ``truth_...``): for tracking."""
+        """All known numbers by flat name (those of parts as ``truth_...``, ``own_...``): for tracking."""
         found: dict[str, float] = {}
-        for prefix, holder in (("", self), ("truth_", self.truth)):
+        parts = {f"{name}_": getattr(self, name) for name in PARTS}
+        for prefix, holder in (("", self), *parts.items()):
             for f in fields(holder) if holder is not None else ():
                 value = getattr(holder, f.name)
                 if isinstance(value, (int, float)) and not isinstance(value, bool) and f.name not in {"round", "seed"}:

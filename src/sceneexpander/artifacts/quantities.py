@@ -102,33 +102,107 @@ METHOD_TITLES = {
     "sceneexpander_optimised": "SceneExpander + post-optimisation (3DGS)",
 }
 
+
+def _at_size(
+    part: str, group: Group, where: str, title: str, meanings: tuple[str, str, str, str]
+) -> tuple[Quantity, ...]:
+    """The numbers of a `SizeMetrics`: PSNR, SSIM, ST-LPIPS and the open share."""
+    psnr, ssim, st_lpips, opened = meanings
+    behind = f", {title}" if title else ""
+    return (
+        Quantity(
+            name=f"{part}.psnr_db",
+            metric=f"psnr_{where}_db",
+            group=group,
+            title=f"PSNR{behind}",
+            unit="dB",
+            better="higher",
+            meaning=psnr,
+        ),
+        Quantity(
+            name=f"{part}.ssim",
+            metric=f"ssim_{where}",
+            group=group,
+            title=f"SSIM{behind}",
+            digits=3,
+            better="higher",
+            meaning=ssim,
+        ),
+        Quantity(
+            name=f"{part}.st_lpips",
+            metric=f"st_lpips_{where}",
+            group=group,
+            title=f"ST-LPIPS{behind}",
+            digits=4,
+            better="lower",
+            meaning=st_lpips,
+        ),
+        Quantity(
+            name=f"{part}.open_share",
+            metric=f"seen_through_{where}",
+            group=group,
+            title=f"Open{behind}",
+            unit="%",
+            digits=1,
+            better="lower",
+            meaning=opened,
+        ),
+    )
+
+
 QUALITY = (
+    *_at_size(
+        "own",
+        Group.QUALITY,
+        "at_photo_size",
+        "",
+        (
+            "Preservation: captured views rendered at the method's own cameras, against the photos in the photos' own pixels; "
+            "mean over views.",
+            "The same, structural similarity.",
+            "The same, shift-tolerant perceptual distance.",
+            "Share of what the photos show that one looks through there (alpha below 0.9).",
+        ),
+    ),
     Quantity(
         name="psnr_db",
         metric="psnr_captured_db",
         group=Group.QUALITY,
-        title="PSNR",
+        title="PSNR, stored size",
         unit="dB",
         better="higher",
-        meaning="Preservation: captured views rendered at the method's own cameras, against the photos; mean over views.",
+        meaning="The same at the size that the methods were given.",
     ),
     Quantity(
         name="ssim",
         metric="ssim_captured",
         group=Group.QUALITY,
-        title="SSIM",
+        title="SSIM, stored size",
         digits=3,
         better="higher",
-        meaning="The same, structural similarity.",
     ),
     Quantity(
         name="st_lpips",
         metric="st_lpips_captured",
         group=Group.QUALITY,
-        title="ST-LPIPS",
+        title="ST-LPIPS, stored size",
         digits=4,
         better="lower",
-        meaning="The same, shift-tolerant perceptual distance.",
+    ),
+    *_at_size(
+        "half",
+        Group.QUALITY,
+        "captured_half_size",
+        "half the stored size",
+        ("The same from farther away.", "", "", ""),
+    ),
+    *_at_size("double", Group.QUALITY, "captured_double_size", "twice the stored size", ("", "", "", "")),
+    *_at_size(
+        "quadruple",
+        Group.QUALITY,
+        "captured_quadruple_size",
+        "four times the stored size",
+        ("", "", "", "The share that one looks through when the pictures are drawn at four times the stored size."),
     ),
     Quantity(
         name="others_psnr_db",
@@ -153,14 +227,26 @@ QUALITY = (
 )
 
 INSERTION = (
+    *_at_size(
+        "inserted_own",
+        Group.INSERTION,
+        "at_picture_size",
+        "inserted view",
+        (
+            "Expansion: the scene at the inserted camera against the inserted picture, in that picture's own pixels.",
+            "",
+            "",
+            "",
+        ),
+    ),
     Quantity(
         name="inserted_psnr_db",
         metric="psnr_inserted_db",
         group=Group.INSERTION,
-        title="Inserted PSNR",
+        title="Inserted PSNR, stored size",
         unit="dB",
         better="higher",
-        meaning="Expansion: the scene at the inserted camera against the inserted picture.",
+        meaning="The same at the size that the methods were given.",
     ),
     Quantity(
         name="inserted_ssim",

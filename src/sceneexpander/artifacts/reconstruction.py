@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.artifacts.store import load_artifact, load_fields, refusing, save_artifact
-from sceneexpander.geometry.gaussians import GaussianCounts, Gaussians
+from sceneexpander.geometry.gaussians import ROWS, GaussianCounts, Gaussians
 
 SCHEMA = "reconstruction/1"
 _VIEW_TENSORS = ("camera_vector", "world_from_cam", "intrinsics_px", "depth", "depth_conf", "normals", "normals_conf")
@@ -54,8 +54,9 @@ class Reconstruction:
     def save(self, folder: Path) -> None:
         """Write into a (scratch) folder."""
         tensors = {name: getattr(self, name) for name in (*_VIEW_TENSORS, "generated", "posed")}
-        tensors |= {f"gaussians.{f.name}": getattr(self.gaussians, f.name) for f in fields(Gaussians)}
+        tensors |= {f"gaussians.{name}": getattr(self.gaussians, name) for name in ROWS}
         facts = {name: getattr(self, name) for name in ("method", "model", "weights_sha256", "view_ids")}
+        facts["antialiased"] = self.gaussians.antialiased
         facts["counts"] = None if self.counts is None else asdict(self.counts)
         save_artifact(folder, SCHEMA, facts, tensors)
 
@@ -64,6 +65,7 @@ class Reconstruction:
         """Read what `save` wrote. Raises `ArtifactError` for a damaged or invalid artefact."""
         facts, tensors = load_artifact(folder, SCHEMA)
         with refusing(folder):
-            gaussians = Gaussians(**load_fields(Gaussians, {}, tensors, folder, prefix="gaussians."))
+            meant = {"antialiased": facts.pop("antialiased")} if "antialiased" in facts else {}
+            gaussians = Gaussians(**load_fields(Gaussians, meant, tensors, folder, prefix="gaussians."))
             facts_and_views = load_fields(cls, facts, tensors, folder, given=("gaussians",))
             return cls(**facts_and_views, gaussians=gaussians)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -82,6 +82,9 @@ class ViewRecord:
 class ViewSet:
     """S views of one size. ``detail_images`` show the same framing at a higher resolution, for feature matching.
 
+    ``photos`` show the same framing as well, each in the pixels of its own original (up to a limit of the ingest): what the scene is
+    measured against and fitted to. None: nothing finer than the detail images is known.
+
     ``valid`` are the pixels that show the place: not what was transparent, the border of a padded picture, bars, or an overlay.
     None: all of them.
     """
@@ -90,6 +93,7 @@ class ViewSet:
     images: Float[Tensor, "view 3 height width"]  # RGB in [0, 1]
     detail_images: Float[Tensor, "view 3 detail_height detail_width"]
     valid: Bool[Tensor, "view height width"] | None = None
+    photos: tuple[UInt8[Tensor, "3 photo_height photo_width"], ...] | None = None
 
     def __post_init__(self) -> None:
         ids = [record.view_id for record in self.records]
@@ -101,6 +105,8 @@ class ViewSet:
             )
         if self.images.ndim != 4 or self.images.shape[1] != 3:
             raise ValueError(f"images have shape {tuple(self.images.shape)}, expected (view, 3, height, width)")
+        if self.photos is not None and len(self.photos) != len(ids):
+            raise ValueError(f"{len(ids)} records, {len(self.photos)} photos")
         if self.valid is not None and self.valid.shape != (len(ids), *self.images.shape[2:]):
             raise ValueError(f"masks have shape {tuple(self.valid.shape)}, images {tuple(self.images.shape)}")
 
@@ -135,6 +141,7 @@ class ViewSet:
             images=self.images[picked],
             detail_images=self.detail_images[picked],
             valid=None if self.valid is None else self.valid[picked],
+            photos=None if self.photos is None else tuple(self.photos[i] for i in picked),
         )
 
     def append(self, other: ViewSet) -> ViewSet:
@@ -147,6 +154,7 @@ class ViewSet:
             images=torch.cat([self.images, other.images]),
             detail_images=torch.cat([self.detail_images, other.detail_images]),
             valid=torch.cat([self.validity(), other.validity().to(self.images.device)]) if masked else None,
+            photos=None if self.photos is None and other.photos is None else self._finest() + other._finest(),
         )
 
     def with_pictures_of(self, other: ViewSet) -> ViewSet:
@@ -157,7 +165,23 @@ class ViewSet:
         for index, there in both:
             records[index] = other.records[there]
             images[index], detail_images[index] = other.images[there], other.detail_images[there]
-        return replace(self, records=tuple(records), images=images, detail_images=detail_images)
+        photos = None
+        if self.photos is not None or other.photos is not None:
+            theirs = other._finest()
+            finest = {index: theirs[there] for index, there in both}
+            photos = tuple(finest.get(index, mine) for index, mine in enumerate(self._finest()))
+        return replace(self, records=tuple(records), images=images, detail_images=detail_images, photos=photos)
+
+    def photo(self, view: int) -> Float[Tensor, "3 photo_height photo_width"]:
+        """One view in the pixels of its original, RGB in [0, 1]; its detail image where no finer one is kept."""
+        if self.photos is None:
+            return self.detail_images[view]
+        return self.photos[view].to(self.images) / 255
+
+    def _finest(self) -> tuple[UInt8[Tensor, "3 photo_height photo_width"], ...]:
+        if self.photos is not None:
+            return self.photos
+        return tuple(to_bytes(image) for image in self.detail_images)
 
     def validity(self) -> Bool[Tensor, "view height width"]:
         """``valid``, written out where everything is."""
@@ -172,14 +196,20 @@ class ViewSet:
         for record, image, detail in zip(self.records, self.images, self.detail_images, strict=True):
             save_png(folder / "images" / f"{record.view_id}.png", image)
             save_png(folder / "detail" / f"{record.view_id}.png", detail)
+        if self.photos is not None:
+            (folder / "photos").mkdir(exist_ok=True)
+            for record, photo in zip(self.records, self.photos, strict=True):
+                save_png(folder / "photos" / f"{record.view_id}.png", photo)
         tensors = {} if self.valid is None else {"valid": self.valid.to(torch.uint8)}
-        save_artifact(folder, SCHEMA, {"records": self.records}, tensors)
+        facts = {"records": self.records, "has_photos": self.photos is not None}
+        save_artifact(folder, SCHEMA, facts, tensors)
 
     @classmethod
     def load(cls, folder: Path) -> ViewSet:
         """Read what `save` wrote. Raises `ArtifactError` if a picture or record is missing or damaged."""
         facts, tensors = load_artifact(folder, SCHEMA)
-        records = read_typed(_Facts, facts, folder / FACTS_NAME).records
+        read = read_typed(_Facts, facts, folder / FACTS_NAME)
+        records = read.records
         if not records:
             raise ArtifactError("holds no views", where=folder, fix=RERUN)
         for record in records:
@@ -190,7 +220,10 @@ class ViewSet:
             images = torch.stack([load_png(folder / "images" / f"{r.view_id}.png") for r in records])
             detail = torch.stack([load_png(folder / "detail" / f"{r.view_id}.png") for r in records])
             valid = tensors["valid"].to(torch.bool) if "valid" in tensors else None
-            return cls(records=records, images=images, detail_images=detail, valid=valid)
+            photos = None
+            if read.has_photos:
+                photos = tuple(_load_bytes(folder / "photos" / f"{r.view_id}.png") for r in records)
+            return cls(records=records, images=images, detail_images=detail, valid=valid, photos=photos)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,24 +231,34 @@ class _Facts:
     """What is not in the pictures."""
 
     records: tuple[ViewRecord, ...]
+    has_photos: bool = False
 
 
 def to_uint8(image: Float[Tensor, "3 height width"]) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """(H, W, 3) bytes of an RGB image in [0, 1], rounded to nearest."""
-    clipped = image.detach().cpu().clamp(0, 1).permute(1, 2, 0)
-    return (clipped * 255 + 0.5).to(torch.uint8).numpy()
+    return to_bytes(image).cpu().permute(1, 2, 0).numpy()
 
 
-def save_png(path: Path, image: Float[Tensor, "3 height width"]) -> None:
-    """Write an RGB image in [0, 1] as an 8-bit PNG."""
-    Image.fromarray(to_uint8(image)).save(path, format="PNG", compress_level=3)
+def to_bytes(image: Float[Tensor, "*batch 3 height width"]) -> UInt8[Tensor, "*batch 3 height width"]:
+    """An RGB image in [0, 1] as bytes, rounded to nearest."""
+    return (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+
+
+def save_png(path: Path, image: Float[Tensor, "3 height width"] | UInt8[Tensor, "3 height width"]) -> None:
+    """Write an RGB image, in [0, 1] or in bytes, as an 8-bit PNG."""
+    pixels = image if image.dtype == torch.uint8 else to_bytes(image)
+    Image.fromarray(pixels.cpu().permute(1, 2, 0).numpy()).save(path, format="PNG", compress_level=3)
 
 
 def load_png(path: Path) -> Float[Tensor, "3 height width"]:
     """Read an 8-bit picture that `save_png` wrote as RGB in [0, 1]."""
+    return _load_bytes(path).to(torch.float32) / 255
+
+
+def _load_bytes(path: Path) -> UInt8[Tensor, "3 height width"]:
     try:
         with Image.open(path) as picture:
             array = np.asarray(picture.convert("RGB"))
     except (OSError, SyntaxError, ValueError) as error:
         raise ArtifactError(f"cannot be read ({error})", where=path, fix="rerun the stage that makes it") from None
-    return torch.from_numpy(array.copy()).permute(2, 0, 1).to(torch.float32) / 255
+    return torch.from_numpy(array.copy()).permute(2, 0, 1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.ranges import OpenShare, check_ranges
-from sceneexpander.splatting.settings import RasterSettings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -14,19 +13,13 @@ class EvaluateConfig:
 
     Attributes:
         coverage_alpha: a pixel counts as covered if its alpha is above this.
-        antialiased: render with the antialiased opacity compensation.
         cross_view: also compare each view with what the other views' Gaussians show (one more rendering per view).
         st_lpips: also the perceptual distance, where the package ``stlpips-pytorch`` is installed.
     """
 
     coverage_alpha: OpenShare = 0.5
-    antialiased: bool = False
     cross_view: bool = True
     st_lpips: bool = True
 
     def __post_init__(self) -> None:
         check_ranges(self)
-
-    def raster_settings(self) -> RasterSettings:
-        """As the renderer takes them."""
-        return RasterSettings(antialiased=self.antialiased)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.artifacts.metrics import Fit, MetricsRow, ViewMetrics
+from sceneexpander.artifacts.metrics import SIZES, Fit, MetricsRow, SizeMetrics, ViewMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
@@ -95,6 +96,8 @@ def evaluate(
         inserted_others_psnr_db=None if new is None else new.others_psnr_db,
         navigation_coverage=None if frames is None else float(frames.double().mean()),
         navigation_frames=0 if frames is None else len(frames),
+        **{name: _mean_size([getattr(row, name) for row in counted]) for name in SIZES},  # type: ignore[arg-type]
+        inserted_own=None if new is None else new.own,
         truth=None if truth is None else against_truth(reconstruction, views, truth, round_number=round_number),
         views=(*captured, *inserted),
         versions=_versions(),
@@ -112,6 +115,16 @@ def _mean_of_all(rows: tuple[ViewMetrics, ...], name: str) -> float | None:
     """Mean over the views, or None as soon as one of them has no value: a mean over fewer views is another number."""
     values = [getattr(row, name) for row in rows]
     return None if any(value is None for value in values) else _mean(values)
+
+
+def _mean_size(sizes: list[SizeMetrics | None]) -> SizeMetrics | None:
+    """Means over the views; a number that one of them lacks is left out."""
+    known = [size for size in sizes if size is not None]
+    if len(known) < len(sizes):
+        return None
+    columns = {f.name: [getattr(size, f.name) for size in known] for f in fields(SizeMetrics)}
+    means: dict[str, Any] = {name: None if None in values else _mean(values) for name, values in columns.items()}
+    return SizeMetrics(**means)
 
 
 def _versions() -> dict[str, str]:

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import fields, replace
 
-from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics
+from sceneexpander.artifacts.metrics import PARTS, MetricsRow
 
 
 def over_repeats(rows: Sequence[MetricsRow]) -> MetricsRow:
@@ -21,17 +21,20 @@ def over_repeats(rows: Sequence[MetricsRow]) -> MetricsRow:
     if len(rows) == 1:
         return first
     names = [f.name for f in fields(MetricsRow) if f.type in ("float", "float | None")]
-    truths = [] if first.truth is None else [f.name for f in fields(TruthMetrics)]
-    found = {name: [row.value(name) for row in rows] for name in (*names, *(f"truth.{name}" for name in truths))}
+    parts = {part: getattr(first, part) for part in PARTS if getattr(first, part) is not None}
+    nested = {part: [f.name for f in fields(held)] for part, held in parts.items()}
+    of_parts = [f"{part}.{name}" for part, inside in nested.items() for name in inside]
+    found = {name: [row.value(name) for row in rows] for name in (*names, *of_parts)}
     known = {name: [v for v in values if v is not None] for name, values in found.items() if None not in values}
     means = {name: statistics.fmean(values) for name, values in known.items()}
-    truth = first.truth
-    if truth is not None:
-        truth = replace(truth, **{name: means.get(f"truth.{name}") for name in truths})
+    merged = {
+        part: replace(held, **{name: means.get(f"{part}.{name}") for name in nested[part]})
+        for part, held in parts.items()
+    }
     return replace(
         first,
         repeats=len(rows),
         spread={name: statistics.stdev(values) for name, values in known.items()},
-        truth=truth,
+        **merged,
         **{name: means.get(name) for name in names},  # type: ignore[arg-type]
     )

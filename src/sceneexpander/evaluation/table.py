@@ -1,4 +1,7 @@
-"""Comparison tables in the shape of the paper: one line per method, means over scenes, gaps shown as gaps."""
+"""Comparison tables in the shape of the paper: one line per method, means over scenes, gaps shown as gaps.
+
+Photos are compared at their own resolution first, and at the stored size that the methods were given beside it.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,18 @@ class Column:
 
 
 COLUMNS: tuple[Column, ...] = (
-    Column(name="psnr_db", title="PSNR", better="↑"),
-    Column(name="ssim", title="SSIM", better="↑", digits=3),
-    Column(name="st_lpips", title="ST-LPIPS", better="↓", digits=4),
+    Column(name="own.psnr_db", title="PSNR", better="↑"),
+    Column(name="own.ssim", title="SSIM", better="↑", digits=3),
+    Column(name="own.st_lpips", title="ST-LPIPS", better="↓", digits=4),
+    Column(name="own.open_share", title="open", better="↓", digits=3),
+    Column(name="psnr_db", title="PSNR, stored size", better="↑"),
+    Column(name="ssim", title="SSIM, stored size", better="↑", digits=3),
+    Column(name="st_lpips", title="ST-LPIPS, stored size", better="↓", digits=4),
+    Column(name="half.psnr_db", title="PSNR, half size", better="↑"),
+    Column(name="double.psnr_db", title="PSNR, twice", better="↑"),
+    Column(name="quadruple.open_share", title="open, four times", better="↓", digits=3),
     Column(name="others_psnr_db", title="cross-view PSNR", better="↑"),
+    Column(name="inserted_own.psnr_db", title="insertion PSNR, own size", better="↑", expansion=True),
     Column(name="inserted_psnr_db", title="insertion PSNR", better="↑", expansion=True),
     Column(name="inserted_ssim", title="insertion SSIM", better="↑", digits=3, expansion=True),
     Column(name="inserted_st_lpips", title="insertion ST-LPIPS", better="↓", digits=4, expansion=True),

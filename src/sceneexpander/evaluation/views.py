@@ -9,21 +9,23 @@ Pixels of a picture that do not show the place (`ViewSet.valid`) count in none o
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.artifacts.metrics import ViewMetrics
+from sceneexpander.artifacts.metrics import SIZES, ViewMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import psnr, ssim
 from sceneexpander.evaluation.perceptual import st_lpips
+from sceneexpander.evaluation.sizes import PSNR_CAP_DB, at_sizes
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import align_views
 from sceneexpander.splatting import Render, render
 
-PSNR_CAP_DB = 100.0
 _FEWEST_PIXELS = 64  # fewer covered pixels say nothing about a picture
 
 
@@ -108,7 +110,8 @@ def _rows(
         valid = None if views.valid is None else views.valid[place]
         if valid is not None and int(valid.sum()) < _FEWEST_PIXELS:
             valid = None
-        rows.append(_row(reconstruction, index, views.images[place], valid, config))
+        sizes = at_sizes(reconstruction, index, views.photo(place), valid, config, ("own",) if generated else SIZES)
+        rows.append(replace(_row(reconstruction, index, views.images[place], valid, config), **sizes))  # type: ignore[arg-type]
     return tuple(rows)
 
 
@@ -178,4 +181,4 @@ def _see(
     config: EvaluateConfig,
 ) -> Render:
     """One view, on black."""
-    return render(gaussians, world_from_cam, intrinsics_px, height, width, settings=config.raster_settings())
+    return render(gaussians, world_from_cam, intrinsics_px, height, width)

@@ -25,13 +25,16 @@ _COVERED = 0.5  # alpha from which on a pixel counts as drawn
 class BenchNumbers:
     """Numbers of one reconstruction. None: not defined there (e.g. the inserted view before the insertion).
 
-    Captured region: ``psnr_db``, ``ssim``, ``st_lpips`` and ``others_psnr_db`` as in `MetricsRow`; camera errors between captured
+    Captured region: ``psnr_db``, ``ssim``, ``st_lpips`` and ``others_psnr_db`` as in `MetricsRow`, and the first with ``own_open_share`` at
+    the resolution of the pictures (twice the stored size); camera errors between captured
     views; depth error of the captured views after one common scale. Expanded region, at the *true* intended camera placed in the
     reconstruction by the captured cameras, over what no captured view sees: ``new_psnr_db`` against the consistent picture (black
     where nothing is drawn, so missing content costs), ``new_coverage``, and relative error of the rendered depth over
     the drawn pixels. ``between_psnr_db``: the whole picture at a camera half-way there, which no method was given.
     """
 
+    own_psnr_db: float | None
+    own_open_share: float | None
     psnr_db: float
     ssim: float
     st_lpips: float | None
@@ -76,6 +79,8 @@ def measure(reconstruction: Reconstruction, views: ViewSet, truth: SceneTruth, s
     everywhere = torch.ones_like(scene.between.new_region)
     between_psnr, _, _ = _seen_truly(reconstruction, scene, scene.between, everywhere)
     return BenchNumbers(
+        own_psnr_db=row.value("own.psnr_db"),
+        own_open_share=row.value("own.open_share"),
         psnr_db=row.psnr_db,
         ssim=row.ssim,
         st_lpips=row.st_lpips,

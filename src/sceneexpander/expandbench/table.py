@@ -30,7 +30,9 @@ class Column:
 
 
 COLUMNS: tuple[Column, ...] = (
-    Column(name="psnr_db", title="PSNR ↑"),
+    Column(name="own_psnr_db", title="PSNR ↑"),
+    Column(name="own_open_share", title="open ↓", digits=3, higher=False),
+    Column(name="psnr_db", title="PSNR, stored size ↑"),
     Column(name="ssim", title="SSIM ↑", digits=3),
     Column(name="st_lpips", title="ST-LPIPS ↓", digits=4, higher=False),
     Column(name="others_psnr_db", title="cross-view PSNR ↑"),

@@ -6,10 +6,13 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import UInt8
+from torch import Tensor
 
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
-from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.artifacts.views import ViewSet, to_bytes
 from sceneexpander.errors import UserError
+from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.sfm_types import SparseReconstruction
 
 _log = logging.getLogger(__name__)
@@ -37,7 +40,20 @@ def straighten_views(views: ViewSet, found: SparseReconstruction) -> ViewSet:
         replace(record, distortion=(float(k[0]), float(k[1])))
         for record, k in zip(views.records, distortion.k, strict=True)
     )
-    return ViewSet(records=records, images=images, detail_images=detail, valid=valid)
+    photos = None
+    if views.photos is not None:
+        photos = tuple(_straightened_photo(views, view, distortion) for view in range(len(views)))
+    return ViewSet(records=records, images=images, detail_images=detail, valid=valid, photos=photos)
+
+
+def _straightened_photo(
+    views: ViewSet, view: int, distortion: Distortion
+) -> UInt8[Tensor, "3 photo_height photo_width"]:
+    """One at a time: as floating point numbers, all of them at once would not fit in memory."""
+    photo = views.photo(view)
+    finer = np.array([photo.shape[-1] / views.width, photo.shape[-2] / views.height])
+    own = replace(distortion, intrinsics=distortion.intrinsics[[view]], k=distortion.k[[view]])
+    return to_bytes(own.scaled(finer).straightened(photo[None])[0][0])
 
 
 def report_cameras(views: ViewSet, found: SparseReconstruction) -> CameraReport:

@@ -28,7 +28,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import KnownCameras, Scene
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.store import sha256_of_tensors
-from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.artifacts.views import ViewSet, to_bytes
 from sceneexpander.expansion.cameras import announce_cameras, report_cameras, straighten_views
 from sceneexpander.expansion.loaded import LoadedModel
 from sceneexpander.expansion.optics import known_of, optics_of
@@ -270,7 +270,13 @@ def toned(inputs: RoundInputs, loaded: LoadedModel) -> RoundInputs:
     view = inserted.view
     images = tone.applied(view.images)
     record = replace(view.records[0], sha256=sha256_of_tensors({"toned": images}))
-    changed = replace(view, records=(record,), images=images, detail_images=tone.applied(view.detail_images))
+    changed = replace(
+        view,
+        records=(record,),
+        images=images,
+        detail_images=tone.applied(view.detail_images),
+        photos=(to_bytes(tone.applied(view.photo(0))),),
+    )
     return replace(inputs, toned=changed, corrections=replace(inputs.corrections, gains=tone.gains))
 
 
@@ -382,7 +388,16 @@ def refined(
     if views.valid is not None:
         shown = views.valid.to(reconstruction.depth)
         weights = shown if weights is None else weights * shown
-    return refine(reconstruction, views.images, config, weights=weights, seed=seed, device=device, on_step=on_step)
+    return refine(
+        reconstruction,
+        views.images,
+        config,
+        photos=views.photos,
+        weights=weights,
+        seed=seed,
+        device=device,
+        on_step=on_step,
+    )
 
 
 def refined_round(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 SH_DC = 0.28209479177387814  # value of the constant real spherical harmonic
+ROWS = ("means", "quat_wxyz", "scales", "opacities", "sh", "source_view", "generated")  # tensors, one row per Gaussian
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,6 +19,8 @@ class Gaussians:
 
     ``sh`` holds real spherical harmonics, band 0 first: colour = 0.5 + SH(direction), RGB.
     ``source_view`` is the index of the view whose pixel made the Gaussian, ``generated`` whether that view was a generated one.
+    ``antialiased`` says how opacities are meant: for rasterisers that compensate them for the screen blur (True), or for those that do
+    not (False). Drawn the other way, a scene is too opaque or full of holes at some distances.
     """
 
     means: Float[Tensor, "gaussian 3"]
@@ -26,28 +30,29 @@ class Gaussians:
     sh: Float[Tensor, "gaussian coefficient 3"]
     source_view: Int[Tensor, "gaussian"]
     generated: Bool[Tensor, "gaussian"]
+    antialiased: bool = False
 
     def __post_init__(self) -> None:
         count = self.means.shape[0]
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for name in ROWS:
+            value = getattr(self, name)
             if value.shape[0] != count:
-                raise ValueError(f"Gaussians.{field.name} has {value.shape[0]} rows, means have {count}")
+                raise ValueError(f"Gaussians.{name} has {value.shape[0]} rows, means have {count}")
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
     def select(self, keep: Tensor) -> Gaussians:
         """The Gaussians at a boolean mask or index tensor."""
-        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        return replace(self, **{name: getattr(self, name)[keep] for name in ROWS})
 
     def detach(self) -> Gaussians:
         """The same values outside the autograd graph."""
-        return replace(self, **{f.name: getattr(self, f.name).detach() for f in fields(self)})
+        return replace(self, **{name: getattr(self, name).detach() for name in ROWS})
 
     def to(self, device: torch.device | str) -> Gaussians:
         """The same Gaussians on another device."""
-        return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        return replace(self, **{name: getattr(self, name).to(device) for name in ROWS})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,10 +79,13 @@ class GaussianCounts:
 
 
 def concatenate(parts: list[Gaussians]) -> Gaussians:
-    """All Gaussians of the parts, in order."""
+    """All Gaussians of the parts, in order; the parts' opacities must be meant alike."""
     if not parts:
         raise ValueError("concatenate needs at least one set of Gaussians")
-    return Gaussians(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)})
+    if len({part.antialiased for part in parts}) > 1:
+        raise ValueError("Gaussians for antialiasing rasterisers and others cannot be one scene")
+    rows: dict[str, Any] = {name: torch.cat([getattr(p, name) for p in parts]) for name in ROWS}
+    return replace(parts[0], **rows)
 
 
 def sh_from_rgb(rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

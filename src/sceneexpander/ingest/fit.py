@@ -13,6 +13,7 @@ from sceneexpander.ingest.config import Fit
 from sceneexpander.ingest.samples import Mask, Pixels
 
 PAD_GREY = 128
+MAX_PHOTO_SIDE_PX = 1600  # of the pictures kept in the originals' own pixels: bounds memory, time and the size of a run
 _SUPPORT = 4  # pixels of the result beyond a border that the resampling filter can reach (three for Lanczos)
 _ROUNDING = 1e-9
 _NEARLY_WHITE = 253
@@ -36,11 +37,13 @@ class FrameSize:
 class FittedPicture:
     """A picture in the common frame. ``kept`` is the share of the original's area that is still visible.
 
+    ``photo`` shows the frame in the original's own pixels, or in fewer where its long side would exceed `MAX_PHOTO_SIDE_PX`.
     ``valid`` are the stored pixels that show the picture, and only such parts of it as show something; None: all.
     """
 
     image: Pixels
     detail: Pixels
+    photo: Pixels
     stored_from_original: Affine
     kept: float
     valid: Mask | None = None
@@ -101,10 +104,17 @@ def fit_picture(pixels: Pixels, frame: FrameSize, fit: Fit = "crop", *, valid: M
     return FittedPicture(
         image=_resampled(source, place, frame.height, frame.width, PAD_GREY),
         detail=_resampled(source, place, frame.detail_height, frame.detail_width, PAD_GREY),
+        photo=_resampled(source, place, *_photo_size(window_height, window_width), PAD_GREY),
         stored_from_original=((scale, 0.0, -left * scale), (0.0, scale, -top * scale)),
         kept=visible / (original_height * original_width),
         valid=None if mask is None else _fitted_mask(mask, place),
     )
+
+
+def _photo_size(window_height: float, window_width: float) -> tuple[int, int]:
+    """(rows, columns) of the frame in the original's pixels: as whole numbers, so that all sizes show the very same framing."""
+    share = min(1.0, MAX_PHOTO_SIDE_PX / max(window_height, window_width))
+    return max(1, round(window_height * share)), max(1, round(window_width * share))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,14 +145,15 @@ def _resampled(
     resample: Image.Resampling = Image.Resampling.LANCZOS,
 ) -> Pixels:
     """The frame's view of ``source`` at a size, with ``ground`` where there is no picture."""
-    factor = height / place.frame.height * place.scale  # pixels of the result per original pixel
-    rows = _covered(place.top, source.height, factor, height)
-    columns = _covered(place.left, source.width, factor, width)
+    # Pixels of the result per original pixel; the two differ where a size had to be rounded.
+    down, along = height / place.frame.height * place.scale, width / place.frame.width * place.scale
+    rows = _covered(place.top, source.height, down, height)
+    columns = _covered(place.left, source.width, along, width)
     box = (
-        place.left + columns[0] / factor,
-        place.top + rows[0] / factor,
-        place.left + columns[1] / factor,
-        place.top + rows[1] / factor,
+        place.left + columns[0] / along,
+        place.top + rows[0] / down,
+        place.left + columns[1] / along,
+        place.top + rows[1] / down,
     )
     canvas, offset = _padded(source, box, ground)
     shifted = (

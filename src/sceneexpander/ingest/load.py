@@ -251,6 +251,7 @@ def view_from_fitted(
         images=image_tensor(fitted.image)[None],
         detail_images=image_tensor(fitted.detail)[None],
         valid=None if fitted.valid is None else torch.from_numpy(fitted.valid)[None],
+        photos=(torch.from_numpy(fitted.photo).permute(2, 0, 1),),
     )
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from sceneexpander.errors import UserError
 from sceneexpander.optimisation.config import DensityConfig
 from sceneexpander.optimisation.density import Schedule, Seen
-from sceneexpander.optimisation.splats import Splats
+from sceneexpander.optimisation.splats import FIXED, Splats
 
 _NEVER = 2**62
 
@@ -68,8 +68,8 @@ class GsplatControl:
         if self._config.strategy == "mcmc":
             arguments["lr"] = mean_rate
         self._strategy.step_post_backward(**arguments)
-        # Rows that gsplat copies become trainable by default; provenance must not.
-        for name in ("source_view", "generated"):
+        # Rows that gsplat copies become trainable by default; those that are never trained must not.
+        for name in FIXED:
             splats.params[name] = nn.Parameter(splats.params[name].detach(), requires_grad=False)
 
     def state(self) -> dict[str, Tensor]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
@@ -21,8 +21,9 @@ from sceneexpander.optimisation.cameras import RefinedCameras
 from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
 from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.optimisation.density import CloneAndSplit, DensityControl, Relocation, Seen
+from sceneexpander.optimisation.pictures import Picture, Pictures
 from sceneexpander.optimisation.splats import Splats, thinned
-from sceneexpander.splatting import rasterise, render
+from sceneexpander.splatting import RasterSettings, rasterise, render
 
 FEWEST_VIEWS = 2  # with known cameras: one view alone says nothing about where things are
 _MARGIN = WINDOW // 2  # SSIM's windows lie inside the picture
@@ -30,6 +31,7 @@ _COVERED = 0.5  # alpha above which a pixel's rendered depth means something
 _EXTENT_MARGIN = 1.1
 _LEAST_EXTENT = 0.1  # of the median depth: cameras close together still look at a scene of some size
 _DEGREE_SHARE = 1 / 30  # of the steps, before the colours may depend on the direction one degree more
+_COMPENSATED = RasterSettings(antialiased=True)
 _log = logging.getLogger(__name__)
 
 
@@ -63,14 +65,17 @@ def optimise(
     *,
     method: str,
     seed: int,
+    photos: Sequence[UInt8[Tensor, "3 photo_height photo_width"]] | None = None,
     valid: Bool[Tensor, "view height width"] | None = None,
     device: torch.device | str = "cpu",
     checkpoint_folder: Path | None = None,
     on_step: Callable[[int, float], None] | None = None,
 ) -> OptimisationResult:
-    """Optimise the Gaussians of ``start`` on the pictures of its views, generated ones included, on black.
+    """Optimise the Gaussians of ``start`` on the pictures of its views, generated ones included.
 
-    Views without a known camera are left out. On a CPU the same input gives the same bits, interrupted or not.
+    Pictures are taken at several sizes and before backgrounds of random colours, and no Gaussian gets narrower than what its finest view
+    resolves, as in `sceneexpander.optimisation.refine`. Views without a known camera are left out. On a CPU the same input gives the
+    same bits, interrupted or not.
 
     Args:
         start: cameras and Gaussians to start from.
@@ -78,6 +83,7 @@ def optimise(
         config: settings.
         method: name of the result.
         seed: of every random draw.
+        photos: the same pictures in the photos' own pixels; None: nothing finer is known.
         valid: pixels that show the place; the others count nothing. None: all.
         device: where to work.
         checkpoint_folder: resume points; None: none are kept.
@@ -91,7 +97,7 @@ def optimise(
         raise ValueError(
             problem or f"pictures of {tuple(images.shape)} do not fit depths of {tuple(start.depth.shape)}"
         )
-    run = _Run(start, images, config, valid=valid, seed=seed, device=torch.device(device))
+    run = _Run(start, images, config, photos=photos, valid=valid, seed=seed, device=torch.device(device))
     first = run.resume(checkpoint_folder)
     if first:
         _log.info("resumed the optimisation after step %d", first)
@@ -113,28 +119,37 @@ class _Run:
         images: Float[Tensor, "view 3 height width"],
         config: OptimiseConfig,
         *,
+        photos: Sequence[UInt8[Tensor, "3 photo_height photo_width"]] | None,
         valid: Bool[Tensor, "view height width"] | None,
         seed: int,
         device: torch.device,
     ) -> None:
         self._start, self._config, self._seed, self._device = start, config, seed, device
-        self._images = images.to(device)
-        self._weights = None if valid is None else valid.to(device, images.dtype)
-        self._intrinsics = start.intrinsics_px.to(device)
+        weights = None if valid is None else valid.to(images.dtype)
+        self._pictures = Pictures(images, photos, start.intrinsics_px, weights, device)
         self._views = start.posed.nonzero()[:, 0].tolist()
         self._extent = scene_extent(start)
-        kept = thinned(start.gaussians, config.start_gaussians, child_generator(seed, "optimise/start"))
-        self.splats = Splats.of(kept.to(device), config.rates, extent=self._extent, sh_degree=config.sh_degree)
+        kept = thinned(start.gaussians, config.start_gaussians, child_generator(seed, "optimise/start")).to(device)
+        kept = self._pictures.compensated(kept, start.world_from_cam.to(device))
+        self.splats = Splats.of(
+            kept,
+            config.rates,
+            extent=self._extent,
+            sh_degree=config.sh_degree,
+            finest=self._finest_pixel(kept.means),
+        )
         self._cameras = RefinedCameras(start.world_from_cam.to(device), rate=config.rates.poses, extent=self._extent)
         self._density = density_control(config, extent=self._extent, device=device)
         self.losses: list[float] = []
-        self._key = _run_key(start, images, valid, config, seed)
+        self._key = _run_key(start, images, photos, valid, config, seed)
 
     def step(self, step: int) -> float:
         """One view, one update."""
         view = self._view_of(step)
         rate = self._set_mean_rate(step)
-        height, width = self._images.shape[2:]
+        picture = self._picture(view, step)
+        height, width = picture.height, picture.width
+        background = torch.rand(3, generator=child_generator(self._seed, f"optimise/background/{step}"))
         splats = self.splats
         offsets = torch.zeros(1, len(splats), 2, device=self._device, requires_grad=True)
         seen = rasterise(
@@ -144,14 +159,15 @@ class _Run:
             splats.opacities,
             splats.colours(self._degree(step)),
             self._cameras.cam_from_world(view),
-            self._intrinsics[view : view + 1],
+            picture.intrinsics_px[None],
             height,
             width,
+            background=background.to(picture.rgb),
             screen_offsets=offsets,
             with_depth=False,
+            settings=_COMPENSATED,
         )
-        weights = None if self._weights is None else self._weights[view]
-        loss = photometric_loss(seen.rgb[0], self._images[view], self._config.ssim_weight, weights)
+        loss = photometric_loss(seen.rgb[0], picture.rgb, self._config.ssim_weight, picture.weights)
         (loss + self._density.penalty(splats)).backward()  # type: ignore[no-untyped-call]
         assert offsets.grad is not None  # noqa: S101 - every picture depends on them
         facts = Seen(centre_gradient=offsets.grad[0], radius_px=seen.radius_px[0], height=height, width=width)
@@ -160,6 +176,8 @@ class _Run:
         self._cameras.step(rate / (self._extent * self._config.rates.means))
         generator = child_generator(self._seed, f"optimise/density/{step}")
         self._density.change(splats, step, mean_rate=rate, generator=generator)
+        if step % self._config.density.every == 0:
+            splats.limit_band(self._finest_pixel(splats.params["means"]))
         self.losses.append(float(loss.detach()))
         return self.losses[-1]
 
@@ -168,6 +186,14 @@ class _Run:
         turn, place = divmod(step - 1, len(self._views))
         order = torch.randperm(len(self._views), generator=child_generator(self._seed, f"optimise/order/{turn}"))
         return int(self._views[int(order[place])])
+
+    def _picture(self, view: int, step: int) -> Picture:
+        """What the view of a step is compared with: sizes take turns, the photo's own among them."""
+        turn = (step - 1) // len(self._views)
+        return (self._pictures.stored, self._pictures.own, self._pictures.stored, self._pictures.half)[turn % 4](view)
+
+    def _finest_pixel(self, means: Float[Tensor, "gaussian 3"]) -> Float[Tensor, " gaussian"]:
+        return self._pictures.finest_pixel(means, self._start.world_from_cam.to(self._device), self._views)
 
     def _set_mean_rate(self, step: int) -> float:
         rates = self._config.rates
@@ -211,7 +237,8 @@ class _Run:
         depth = start.depth.clone()
         for view in self._views:
             one = slice(view, view + 1)
-            seen = render(gaussians.to(self._device), poses[one].to(self._device), self._intrinsics[one], height, width)
+            lens = start.intrinsics_px[one].to(self._device)
+            seen = render(gaussians.to(self._device), poses[one].to(self._device), lens, height, width)
             shown = (seen.alpha > _COVERED) & (seen.depth > 0)
             depth[one] = torch.where(shown.cpu(), seen.depth.cpu(), depth[one])
         return replace(
@@ -250,9 +277,16 @@ def density_control(config: OptimiseConfig, *, extent: float, device: torch.devi
     return CloneAndSplit(config.density, config.steps, extent=extent)
 
 
-def _run_key(start: Reconstruction, images: Tensor, valid: Tensor | None, config: OptimiseConfig, seed: int) -> str:
+def _run_key(
+    start: Reconstruction,
+    images: Tensor,
+    photos: Sequence[Tensor] | None,
+    valid: Tensor | None,
+    config: OptimiseConfig,
+    seed: int,
+) -> str:
     digest = hashlib.sha256(f"{config!r}:{seed}".encode())
-    given = (images, start.gaussians.means, start.gaussians.sh, start.world_from_cam)
-    for value in given if valid is None else (*given, valid):
+    given = [images, start.gaussians.means, start.gaussians.sh, start.world_from_cam, *(photos or ())]
+    for value in given if valid is None else [*given, valid]:
         digest.update(value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -1,19 +1,21 @@
 """A short fit of a reconstruction's Gaussians to its own pictures: what the splats of a feed-forward model lack to agree with each other.
 
 Such a model makes every view's Gaussians by themselves. Each set shows its own picture, but where several share a pixel, their colours
-and opacities do not add up to any of the pictures. Under a hundred steps of the rasteriser settle most of that, at the captured cameras
-and between them (docs/refinement.md). Cameras, depth and normals stay as the model made them, and no Gaussian comes or goes: longer
-optimisation with densification is `sceneexpander.optimisation.optimise`.
+and opacities do not add up to any of the pictures. A few visits to every view settle most of that, at the captured cameras and between
+them (docs/refinement.md). The pictures are taken at several sizes, that of the photos included, before a background of another colour each
+time, and no Gaussian gets narrower than what its finest view resolves: so the scene holds at other distances, too. Cameras, depth and
+normals stay as the model made them, and no Gaussian comes or goes: longer optimisation with densification is
+`sceneexpander.optimisation.optimise`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
@@ -21,15 +23,20 @@ from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.optimisation.config import RatesConfig, RefineConfig
 from sceneexpander.optimisation.optimise import photometric_loss, scene_extent
+from sceneexpander.optimisation.pictures import Picture, Pictures
 from sceneexpander.optimisation.splats import Splats
-from sceneexpander.splatting import rasterise
+from sceneexpander.splatting import RasterSettings, rasterise
 
 _LAST_RATE = 0.05  # of the first, reached along a cosine
+_COMPENSATED = RasterSettings(antialiased=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineReport:
-    """Mean photometric loss over the target views before and after; the old Gaussians are kept if it did not fall."""
+    """Mean photometric loss over the target views, as their photos show them, before and after.
+
+    The old Gaussians are kept if it did not fall.
+    """
 
     steps: int
     before: float
@@ -46,12 +53,13 @@ def refine(
     images: Float[Tensor, "view 3 height width"],
     config: RefineConfig,
     *,
+    photos: Sequence[UInt8[Tensor, "3 photo_height photo_width"]] | None = None,
     weights: Float[Tensor, "view height width"] | None = None,
     seed: int,
     device: torch.device | str = "cpu",
     on_step: Callable[[int, float], None] | None = None,
 ) -> tuple[Reconstruction, RefineReport | None]:
-    """Fit means, shapes, opacities and colours of ``start``'s Gaussians to the pictures of its posed views, on black.
+    """Fit means, shapes, opacities and colours of ``start``'s Gaussians to the pictures of its posed views.
 
     On a CPU the same input gives the same bits, for any number of threads of the rasteriser.
 
@@ -59,13 +67,15 @@ def refine(
         start: cameras and Gaussians.
         images: pictures of its views, in order, RGB in [0, 1], at its size.
         config: settings; without visits the start is returned.
+        photos: the same pictures in the photos' own pixels; None: nothing finer is known.
         weights: of pixels, in [0, 1]: how much a picture is to be believed there; 1 everywhere by default.
-        seed: order of the views.
+        seed: order of the views and backgrounds.
         device: where to work.
         on_step: told the number of finished steps and the last loss.
 
     Returns:
-        The reconstruction with other Gaussians, and what the fit changed (None: nothing to do).
+        The reconstruction with other Gaussians, meant for rasterisers that compensate for the screen blur, and what the fit changed
+        (None: nothing to do).
 
     Raises:
         ValueError: sizes do not fit.
@@ -78,12 +88,15 @@ def refine(
     steps = config.visits * len(targets)
     if steps == 0 or len(start.gaussians) == 0:
         return start, None
-    fit = _Fit(start, images, config, weights, torch.device(device))
+    pictures = Pictures(images, photos, start.intrinsics_px, weights, torch.device(device))
+    fit = _Fit(start, pictures, config, targets, torch.device(device))
     before = fit.mean_loss(targets)
     for step in range(steps):
         turn, place = divmod(step, len(targets))
         order = torch.randperm(len(targets), generator=child_generator(seed, f"refine/{turn}"))
-        loss = fit.step(targets[int(order[place])], step / steps)
+        background = torch.rand(3, generator=child_generator(seed, f"refine/background/{step}"))
+        picture = fit.picture(targets[int(order[place])], turn)
+        loss = fit.step(targets[int(order[place])], picture, background, step / steps)
         if on_step is not None:
             on_step(step + 1, loss)
     report = RefineReport(steps=steps, before=before, after=fit.mean_loss(targets))
@@ -96,16 +109,15 @@ class _Fit:
     def __init__(
         self,
         start: Reconstruction,
-        images: Float[Tensor, "view 3 height width"],
+        pictures: Pictures,
         config: RefineConfig,
-        weights: Float[Tensor, "view height width"] | None,
+        targets: list[int],
         device: torch.device,
     ) -> None:
-        self._images = images.to(device)
-        self._weights = None if weights is None else weights.to(device)
-        self._cam_from_world = rigid_inverse(start.world_from_cam).to(device)
-        self._intrinsics_px = start.intrinsics_px.to(device)
-        self._ssim_weight = config.ssim_weight
+        self._pictures = pictures
+        world_from_cam = start.world_from_cam.to(device)
+        self._cam_from_world = rigid_inverse(world_from_cam)
+        self._ssim_weight, self._solid = config.ssim_weight, config.solid_weight
         rates = RatesConfig(
             means=config.means,
             scales=config.scales,
@@ -113,39 +125,57 @@ class _Fit:
             opacities=config.opacities,
             colours=config.colours,
         )
-        self._degree = math.isqrt(start.gaussians.sh.shape[1]) - 1
-        self.splats = Splats.of(start.gaussians.to(device), rates, extent=scene_extent(start), sh_degree=self._degree)
+        gaussians = pictures.compensated(start.gaussians.to(device), world_from_cam)
+        self._degree = math.isqrt(gaussians.sh.shape[1]) - 1
+        self.splats = Splats.of(
+            gaussians,
+            rates,
+            extent=scene_extent(start),
+            sh_degree=self._degree,
+            finest=pictures.finest_pixel(gaussians.means, world_from_cam, targets),
+        )
         self._rates = {name: o.param_groups[0]["lr"] for name, o in self.splats.optimisers.items()}
 
-    def step(self, view: int, progress: float) -> float:
+    def picture(self, view: int, turn: int) -> Picture:
+        """What a view is compared with in one of its visits: sizes take turns."""
+        return (self._pictures.own, self._pictures.stored, self._pictures.own, self._pictures.half)[turn % 4](view)
+
+    def step(self, view: int, picture: Picture, background: Float[Tensor, "3"], progress: float) -> float:
         """One view, one update; ``progress`` in [0, 1) says how far the rates have fallen."""
         share = max(0.5 * (1 + math.cos(math.pi * progress)), _LAST_RATE)
         for name, optimiser in self.splats.optimisers.items():
             optimiser.param_groups[0]["lr"] = self._rates[name] * share
-        loss = self._loss(view)
+        loss = self._loss(view, picture, background)
         loss.backward()  # type: ignore[no-untyped-call]
         self.splats.step()
         return float(loss.detach())
 
     @torch.no_grad()
     def mean_loss(self, views: list[int]) -> float:
-        """Of several views."""
-        return float(torch.stack([self._loss(view) for view in views]).mean())
+        """Of several views, on grey."""
+        grey = torch.full((3,), 0.5)
+        return float(torch.stack([self._loss(view, self._pictures.own(view), grey) for view in views]).mean())
 
-    def _loss(self, view: int) -> Float[Tensor, ""]:
-        splats, one = self.splats, slice(view, view + 1)
-        height, width = self._images.shape[2:]
+    def _loss(self, view: int, picture: Picture, background: Float[Tensor, "3"]) -> Float[Tensor, ""]:
+        splats = self.splats
         seen = rasterise(
             splats.params["means"],
             splats.params["quats"],
             splats.scales,
             splats.opacities,
             splats.colours(self._degree),
-            self._cam_from_world[one],
-            self._intrinsics_px[one],
-            height,
-            width,
+            self._cam_from_world[view : view + 1],
+            picture.intrinsics_px[None],
+            picture.height,
+            picture.width,
+            background=background.to(picture.rgb),
             with_depth=False,
+            settings=_COMPENSATED,
         )
-        weights = None if self._weights is None else self._weights[view]
-        return photometric_loss(seen.rgb[0], self._images[view], self._ssim_weight, weights)
+        through = 1 - seen.alpha[0]
+        if picture.weights is not None:
+            through = through * picture.weights
+        return (
+            photometric_loss(seen.rgb[0], picture.rgb, self._ssim_weight, picture.weights)
+            + self._solid * through.mean()
+        )

@@ -1,13 +1,15 @@
 """The Gaussians while they are optimised: unbounded parameters, one Adam each, and rows that come and go.
 
-Names, shapes and activations of the parameters are those of gsplat's strategies, which can therefore work on the same object. Two of
-them are never trained and say where a Gaussian comes from (``source_view``, ``generated``): they follow their rows through every change.
+Names and shapes of the parameters are those of gsplat's strategies, which can therefore work on the same object. Three of them are never
+trained and follow their rows through every change: where a Gaussian comes from (``source_view``, ``generated``), and the standard
+deviation that none of its axes falls below (``narrowest``). What is trained as ``scales`` is the logarithm of the standard deviation
+before that band limit (`sceneexpander.geometry.sampling`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,8 +17,10 @@ from torch import Tensor, nn
 
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.sampling import BAND_LIMIT_PX
 from sceneexpander.optimisation.config import RatesConfig
 
+FIXED = ("source_view", "generated", "narrowest")  # parameters that are never trained
 MAX_START_OPACITY = 0.99  # the logit of 1 is infinite
 MIN_START_SCALE = 1e-9
 ADAM_EPSILON = 1e-15
@@ -31,7 +35,15 @@ class Splats:
     optimisers: dict[str, torch.optim.Adam]
 
     @classmethod
-    def of(cls, gaussians: Gaussians, rates: RatesConfig, *, extent: float, sh_degree: int) -> Splats:
+    def of(
+        cls,
+        gaussians: Gaussians,
+        rates: RatesConfig,
+        *,
+        extent: float,
+        sh_degree: int,
+        finest: Float[Tensor, " gaussian"] | None = None,
+    ) -> Splats:
         """Trainable copies. Colours get coefficients up to ``sh_degree``; higher ones are dropped.
 
         Args:
@@ -39,21 +51,26 @@ class Splats:
             rates: learning rates.
             extent: unit of the rate of the means, scene units.
             sh_degree: of the colours.
+            finest: side of the smallest pixel that sees each Gaussian, for the band limit; None: there is none.
         """
+        narrowest = torch.zeros_like(gaussians.opacities) if finest is None else BAND_LIMIT_PX * finest
+        before_limit = gaussians.scales.square() - narrowest.square()[:, None]
+        # What is narrower already starts at a tenth of the limit: its gradient vanishes with it.
+        least = (0.1 * narrowest[:, None]).clamp(min=MIN_START_SCALE)
         coefficients = (sh_degree + 1) ** 2
         sh = torch.zeros(len(gaussians), coefficients, 3).to(gaussians.sh)
         kept = min(coefficients, gaussians.sh.shape[1])
         sh[:, :kept] = gaussians.sh[:, :kept]
         trained = {
             "means": (gaussians.means, rates.means * extent),
-            "scales": (gaussians.scales.clamp(min=MIN_START_SCALE).log(), rates.scales),
+            "scales": (before_limit.clamp(min=0).sqrt().maximum(least).log(), rates.scales),
             "quats": (nn.functional.normalize(gaussians.quat_wxyz, dim=-1), rates.rotations),
             "opacities": (gaussians.opacities.clamp(1e-4, MAX_START_OPACITY).logit(), rates.opacities),
             "sh0": (sh[:, :1], rates.colours),
         }
         if coefficients > 1:
             trained["shN"] = (sh[:, 1:], rates.view_colours)
-        fixed = {"source_view": gaussians.source_view, "generated": gaussians.generated}
+        fixed = {"source_view": gaussians.source_view, "generated": gaussians.generated, "narrowest": narrowest}
         params = {name: nn.Parameter(value.detach().clone()) for name, (value, _) in trained.items()}
         optimisers = {
             name: torch.optim.Adam([{"params": params[name], "lr": rate, "name": name}], eps=ADAM_EPSILON, fused=True)
@@ -67,8 +84,8 @@ class Splats:
 
     @property
     def scales(self) -> Float[Tensor, "gaussian 3"]:
-        """Standard deviations, scene units."""
-        return self.params["scales"].exp()
+        """Standard deviations, scene units, none below the row's ``narrowest``."""
+        return ((2 * self.params["scales"]).exp() + self.params["narrowest"].square()[:, None]).sqrt()
 
     @property
     def opacities(self) -> Float[Tensor, " gaussian"]:
@@ -93,6 +110,7 @@ class Splats:
                 sh=torch.cat(parts, dim=1),
                 source_view=self.params["source_view"],
                 generated=self.params["generated"],
+                antialiased=True,
             )
             .detach()
             .to("cpu")
@@ -132,6 +150,11 @@ class Splats:
             optimiser.param_groups[0]["params"] = [new]
             if state:
                 optimiser.state[new] = state
+
+    @torch.no_grad()
+    def limit_band(self, finest: Float[Tensor, " gaussian"]) -> None:
+        """Set anew what no axis falls below, for Gaussians that moved: see `of`."""
+        self.params["narrowest"].copy_(BAND_LIMIT_PX * finest)
 
     @torch.no_grad()
     def edit(self, name: str, rows: Tensor, values: Tensor) -> None:
@@ -183,12 +206,4 @@ def thinned(gaussians: Gaussians, limit: int, generator: torch.Generator) -> Gau
     rows = torch.randperm(count, generator=generator)[:limit].sort().values
     kept = gaussians.select(rows.to(gaussians.means.device))
     # On a surface the area per Gaussian grows with the inverse of their number.
-    return Gaussians(
-        means=kept.means,
-        quat_wxyz=kept.quat_wxyz,
-        scales=kept.scales * (count / limit) ** 0.5,
-        opacities=kept.opacities,
-        sh=kept.sh,
-        source_view=kept.source_view,
-        generated=kept.generated,
-    )
+    return replace(kept, scales=kept.scales * (count / limit) ** 0.5)

@@ -53,7 +53,6 @@ class RenderConfig:
         scale: video size relative to the stored images.
         stills: frames that are also kept as pictures, evenly spread.
         background: grey behind the scene, in [0, 1].
-        antialiased: compensate opacities for the rasteriser's blur.
         spz: write the Gaussians as ``gaussians.spz`` too, a tenth of the PLY, without provenance.
     """
 
@@ -68,7 +67,6 @@ class RenderConfig:
     scale: Annotated[float, Range(0, 8, low_open=True)] = 1.0
     stills: Annotated[int, Range(1, 1000)] = 6
     background: Share = 0.08
-    antialiased: bool = False
     spz: bool = False
 
     def __post_init__(self) -> None:

@@ -94,7 +94,7 @@ class _Eye:
     ) -> None:
         self._gaussians = reconstruction.gaussians.to(device)
         self._background = torch.full((3,), config.background, device=device)
-        self._settings = RasterSettings(antialiased=config.antialiased, threads=threads)
+        self._settings = RasterSettings(threads=threads)
         self._device = device
 
     def __call__(self, pose: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], height: int, width: int) -> Render:

@@ -4,6 +4,9 @@ The layout is the usual one of 3D Gaussian splatting: position ``x y z``, unused
 ``f_dc_*`` and ``f_rest_*`` (channel by channel), ``opacity`` as a logit, ``scale_*`` as natural logarithms, ``rot_*`` as a
 scalar-first quaternion; float32, binary little-endian. Provenance follows in two properties that other programs skip:
 ``source_view`` (-1 unknown) and ``generated`` (0 or 1). They are float32 too: some readers take rows for arrays of floats.
+
+A comment says how opacities are meant (`Gaussians.antialiased`), as gsplat, nerfstudio, Brush and splat-transform write and read it:
+``SplatRenderMode: mip`` for rasterisers that compensate them for the screen blur, ``default`` for others.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "sca
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 PROVENANCE = ("source_view", "generated")
 COMPRESSED = {"packed_position", "packed_rotation", "packed_scale", "packed_color"}
+RENDER_MODES = {True: "mip", False: "default"}
 MAX_COUNT_DIGITS = 15
 FEWEST_TO_JUDGE = 10  # of fewer Gaussians nobody can say what their numbers mean
 WIDE_OVERLAP = 3.0  # size of the usual Gaussian in distances between neighbours, beyond which a scene would be fog
@@ -59,7 +63,8 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(rest)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", *ROTATION]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    mode = f"comment SplatRenderMode: {RENDER_MODES[gaussians.antialiased]}"
+    header = ["ply", "format binary_little_endian 1.0", mode, f"element vertex {len(gaussians)}"]
     header += [*(f"property float {name}" for name in (*names, *PROVENANCE)), "end_header"]
     with complete_file(path) as scratch, scratch.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
@@ -89,7 +94,7 @@ def read_ply(path: Path, *, linear: Collection[Linear] = ()) -> Gaussians:
     """Read a scene written here or by other 3D Gaussian splatting programs: any property order and numeric type, with or without
     normals, ascii or binary of either byte order; properties that are not ours are ignored.
 
-    Without provenance, ``source_view`` is -1 and ``generated`` false.
+    Without provenance, ``source_view`` is -1 and ``generated`` false; without a comment on it, ``antialiased`` is false.
 
     Some programs write opacities and scales as they are, and not as logits and logarithms. Nothing in the file says so; the numbers do,
     mostly: see `_refuse_linear`. Such a file is read when the caller says what it is.
@@ -120,6 +125,7 @@ class _Header:
     properties: tuple[tuple[str, str], ...]  # name, numpy type without byte order
     skip: int  # bytes (binary) or lines (ascii) of elements before the vertices
     is_last: bool  # nothing follows the vertices
+    antialiased: bool  # as a comment says; without one they are not
 
 
 def _read_header(file: BinaryIO, path: Path) -> _Header:
@@ -132,8 +138,12 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
         raise UserError(f"has no end_header in its first {MAX_HEADER_BYTES} bytes", where=path)
     file.seek(newline + 1)
     encoding, elements = "", []  # name, count, properties of each element
+    antialiased = False
     for line in raw[:end].decode("ascii", errors="replace").splitlines()[1:]:
         match line.split():
+            # The second is Postshot's way of saying it.
+            case ["comment", "SplatRenderMode:", "mip"] | ["comment", "antialiased", "1"]:
+                antialiased = True
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case ["format", name, "1.0"]:
@@ -161,7 +171,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
     properties = tuple(elements[at][2])
     if len({name for name, _ in properties}) != len(properties):
         raise UserError("names a vertex property twice", where=path)
-    return _Header(encoding, elements[at][1], properties, skip, at == len(elements) - 1)
+    return _Header(encoding, elements[at][1], properties, skip, at == len(elements) - 1, antialiased)
 
 
 def _read_table(file: BinaryIO, header: _Header, path: Path) -> NDArray[np.void]:
@@ -288,6 +298,7 @@ def _gaussians(table: NDArray[np.void], header: _Header, path: Path, linear: fro
         sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], higher], 1),
         source_view=torch.from_numpy(source_view),
         generated=torch.from_numpy(table["generated"] != 0 if "generated" in names else np.zeros(len(table), bool)),
+        antialiased=header.antialiased,
     )
     for name in ("means", "quat_wxyz", "scales", "opacities", "sh"):
         bad = (~torch.isfinite(getattr(scene, name))).nonzero()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -36,6 +36,8 @@ def render(
 ) -> Render:
     """Render a scene; differentiable in the Gaussians and the camera poses (intrinsics are constants).
 
+    Opacities are compensated for the screen blur as the scene says (`Gaussians.antialiased`), whatever the settings do.
+
     Raises:
         ValueError: bad input, naming the tensor and the first bad row (see `rasterise`).
     """
@@ -51,7 +53,7 @@ def render(
         width,
         features=gaussians.generated.to(gaussians.means.dtype)[:, None],
         background=background,
-        settings=settings,
+        settings=replace(settings, antialiased=gaussians.antialiased),
     )
     assert out.depth is not None and out.features is not None  # noqa: S101, PT018 - both were asked for
     generated = out.features[:, 0] / out.alpha.clamp(min=MIN_COVERAGE)
@@ -92,7 +94,7 @@ def render_normals(
         width,
         features=torch.where(away, -normals_cam, normals_cam),
         with_depth=False,
-        settings=settings,
+        settings=replace(settings, antialiased=gaussians.antialiased),
     )
     assert out.features is not None  # noqa: S101 - asked for
     return torch.nn.functional.normalize(out.features.movedim(1, -1), dim=-1)

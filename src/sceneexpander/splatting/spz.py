@@ -4,7 +4,7 @@ The format stores bytes, so it loses what a byte cannot hold. Worst cases of wha
 step of 1 / 2^23 of the largest coordinate (a power of two above it); scale 3.2 %; opacity and colour of degree 0 one 255th each;
 rotation 0.2 degrees; higher harmonics 1/16 (degree 1) and 1/8 (degrees 2, 3) as in other writers. Scales outside
 [4.5e-5, 380] are cut there, harmonics outside [-1, 1] and colours outside [-0.44, 1.44] as well; `write_spz` returns how many.
-**Provenance is lost**: SPZ has no place for it. Write a PLY to keep it.
+**Provenance is lost**: SPZ has no place for it. Write a PLY to keep it. How opacities are meant (`Gaussians.antialiased`) is kept.
 
 Layout: a header of 16 bytes, then positions (24-bit fixed point), opacities, colours, logarithms of the scales, rotations (the
 smallest three components of the quaternion in 10 bits each), higher harmonics; everything through gzip. Axes are x right, y up,
@@ -34,6 +34,7 @@ from sceneexpander.splatting.torch_backend import sh_basis
 MAGIC = 0x5053474E  # "NGSP"
 VERSION = 3
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
+ANTIALIASED = 1  # the bit of the flags
 COORDINATE_LIMIT = (1 << 23) - 1
 MOST_FRACTIONAL_BITS = 23
 COLOUR_GAIN = 0.15  # a byte of colour is 255 * (0.5 + gain * coefficient)
@@ -74,7 +75,9 @@ def write_spz(gaussians: Gaussians, path: Path) -> int:
     scales, cut_scales = _bytes(SCALE_STEPS * (scene.scales.clamp(min=1e-30).log() + SCALE_OFFSET))
     harmonics, cut_harmonics = _bytes(_rounded(SH_GAIN * (1 + scene.sh[:, 1:] * _signs(degree))))
     columns = [positions, opacities, colours, scales, _pack_rotations(scene.quat_wxyz), harmonics]
-    body = HEADER.pack(MAGIC, VERSION, len(scene), degree, bits, 0, 0) + b"".join(c.tobytes() for c in columns)
+    body = HEADER.pack(MAGIC, VERSION, len(scene), degree, bits, ANTIALIASED * scene.antialiased, 0) + b"".join(
+        c.tobytes() for c in columns
+    )
     with complete_file(path) as scratch, scratch.open("wb") as file:
         # No time and no name inside: the same scene gives the same bytes.
         with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0, compresslevel=6) as packed:
@@ -96,7 +99,7 @@ def read_spz(path: Path) -> Gaussians:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"cannot be read ({reason})", where=str(path)[:300]) from None
-    version, count, degree, bits, body = _unpack(raw, path)
+    version, count, degree, bits, flags, body = _unpack(raw, path)
     at = 0
 
     def take(*shape: int) -> NDArray[np.uint8]:
@@ -121,11 +124,12 @@ def read_spz(path: Path) -> Gaussians:
         sh=torch.cat([colours[:, None], higher], 1),
         source_view=torch.full((count,), -1),
         generated=torch.zeros(count, dtype=torch.bool),
+        antialiased=bool(flags & ANTIALIASED),
     )
 
 
-def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, NDArray[np.uint8]]:
-    """(version, count, degree, fractional bits, everything after the header); never inflates more than the header announces."""
+def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, int, NDArray[np.uint8]]:
+    """(version, count, degree, fractional bits, flags, everything after the header); never inflates more than the header announces."""
     if raw[:4] == MAGIC.to_bytes(4, "little"):  # the header of versions before is compressed like the rest
         version = int.from_bytes(raw[4:8], "little")
         fix = "write it as version 3 or as PLY, e.g. with splat-transform"
@@ -135,7 +139,7 @@ def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, NDArray[np.uint
         head = inflate.decompress(raw, HEADER.size)
         if len(head) < HEADER.size:
             raise UserError("is not an SPZ file (too short)", where=path)
-        magic, version, count, degree, bits, _, _ = HEADER.unpack(head)
+        magic, version, count, degree, bits, flags, _ = HEADER.unpack(head)
         if magic != MAGIC:
             raise UserError("is not an SPZ file (its mark is missing)", where=path)
         if version not in _ROTATION_BYTES:
@@ -157,7 +161,7 @@ def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, NDArray[np.uint
         raise UserError("is truncated: its check sum is missing", where=path)
     if inflate.unused_data:
         raise UserError(f"holds {len(inflate.unused_data)} bytes behind its end", where=path)
-    return version, count, degree, bits, np.frombuffer(body, np.uint8)
+    return version, count, degree, bits, flags, np.frombuffer(body, np.uint8)
 
 
 def _bytes(values: Float[Tensor, "gaussian *rest"]) -> tuple[NDArray[np.uint8], Tensor]:

@@ -35,18 +35,28 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import load_artifact, load_fields, refusing, save_artifact
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.rigid import rigid_inverse
-from sceneexpander.splatting import rasterise, render
+from sceneexpander.splatting import RasterSettings, rasterise, render
 from sceneexpander.splatting.torch_backend import shade
 from sceneexpander.viewer.cameras import Cameras
 
-SCHEMA = "packed-splats/2"
+SCHEMA = "packed-splats/3"
 SPLATS_PER_METHOD = 400_000  # at most: three methods stay below 30 MB of page
 FAITHFUL_DB = 33.0  # PSNR of the worst view against all Gaussians at which no more are added
 _FEWEST, _MORE = 150_000, 50_000  # where the search for the number begins, and its step
 _EQUAL_DB = 100.0
 BYTES_PER_SPLAT = 18
 _CAMERA_TENSORS = ("generated", "posed", "world_from_cam", "intrinsics_px", "focus")
-_FACTS = ("method", "model", "total", "worst_view_db", "origin", "reach", "log_scale_low", "log_scale_high")
+_FACTS = (
+    "method",
+    "model",
+    "total",
+    "worst_view_db",
+    "origin",
+    "reach",
+    "log_scale_low",
+    "log_scale_high",
+    "antialiased",
+)
 _LOG_SCALE_RANGE = 14.0  # a step of 5.6 % at most
 _HALF_ROOT = math.sqrt(0.5)
 _QUAT_STEPS = 1023
@@ -68,6 +78,7 @@ class PackedSplats:
     reach: float
     log_scale_low: float
     log_scale_high: float
+    antialiased: bool  # see `Gaussians`
     data: UInt8[Tensor, " byte"]
 
     def __post_init__(self) -> None:
@@ -123,6 +134,7 @@ def visible_weight(reconstruction: Reconstruction, *, device: torch.device | str
                 width,
                 features=probe,
                 with_depth=False,
+                settings=RasterSettings(antialiased=scene.antialiased),
             )
             assert seen.features is not None  # noqa: S101 - they were asked for
             (weight,) = torch.autograd.grad(seen.features.sum(), probe)
@@ -174,6 +186,7 @@ def pack_splats(
         reach=reach,
         log_scale_low=low,
         log_scale_high=high,
+        antialiased=scene.antialiased,
         data=torch.from_numpy(data.copy()),
     )
 
@@ -196,6 +209,7 @@ def unpack_splats(packed: PackedSplats) -> Gaussians:
         sh=sh_from_rgb(shares[:, None, 3:6].float()),
         source_view=torch.full((count,), -1, dtype=torch.int64),
         generated=torch.from_numpy(octets[7] != 0),
+        antialiased=packed.antialiased,
     )
 
 

@@ -22,6 +22,7 @@ from sceneexpander.viewer.cameras import Cameras, alignment, frustum_length, up_
 from sceneexpander.viewer.packed import PackedSplats
 
 PICTURE_SIDE_PX = 192  # of the pictures in the frusta
+BACKGROUND = 0.5  # grey: what is not there looks like nothing, and not like something black
 TINT_STRENGTH = 0.45  # as in the provenance video
 
 
@@ -39,7 +40,7 @@ def viewer_page(
     methods: Sequence[ShownMethod],
     pictures: Mapping[str, Float[Tensor, "3 height width"]],
     *,
-    background: float = 0.08,
+    background: float = BACKGROUND,
 ) -> str:
     """The HTML text. The same input gives the same bytes.
 
@@ -95,6 +96,7 @@ def _method(item: ShownMethod, main: Cameras) -> dict[str, Any]:
         "origin": splats.origin,
         "reach": splats.reach,
         "log_scale": [splats.log_scale_low, splats.log_scale_high],
+        "antialiased": splats.antialiased,
         "main_from_method": {
             "scale": main_from_method.scale,
             "rotation": main_from_method.rotation.tolist(),

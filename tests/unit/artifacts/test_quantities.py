@@ -9,7 +9,7 @@ import pytest
 
 from sceneexpander.adaptation.loop import StepRecord
 from sceneexpander.adaptation.observe import Look
-from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics
+from sceneexpander.artifacts.metrics import SIZES, MetricsRow, SizeMetrics, TruthMetrics
 from sceneexpander.artifacts.quantities import (
     GROUP_MEANINGS,
     MEASURED,
@@ -30,7 +30,9 @@ def numeric(kind: type) -> set[str]:
 
 def test_every_number_of_a_row_a_step_and_a_look_is_in_the_table() -> None:
     known = {item.name for item in MEASURED}
-    assert numeric(MetricsRow) - {"round", "seed"} | {f"truth.{name}" for name in numeric(TruthMetrics)} == known
+    parts = {f"truth.{name}" for name in numeric(TruthMetrics)}
+    parts |= {f"{part}.{name}" for part in (*SIZES, "inserted_own") for name in numeric(SizeMetrics)}
+    assert numeric(MetricsRow) - {"round", "seed"} | parts == known
     inserted = dict.fromkeys(numeric(StepRecord), 1.0) | {"inserted": True}
     assert len(tracked_step(inserted)) == len(numeric(StepRecord) - {"step", "captured", "restored"})
     assert len(tracked_look(LOOK | dict.fromkeys(numeric(Look) - {"step"}, 1.0))) == len(numeric(Look) - {"step"}) + 3
@@ -46,7 +48,7 @@ def test_names_are_unambiguous_and_such_as_mlflow_takes() -> None:
 
 def test_sorted_by_name_quality_comes_first() -> None:
     names = sorted(item.tracked for item in TABLE)
-    assert names[0] == "1_quality/psnr_captured_db"
+    assert names[0] == "1_quality/psnr_at_photo_size_db"
     assert [group for group in Group if any(name.startswith(group) for name in names)] == list(
         dict.fromkeys(Group(name.partition("/")[0]) for name in names)
     )

@@ -46,7 +46,8 @@ def test_shape_and_means() -> None:
     ]
     header, *lines = cells(comparison_table(rows).csv())
     assert header == [
-        "method", "Gaussians", "cells of 2", "PSNR ↑", "SSIM ↑", "insertion PSNR ↑", "coverage ↑", "coverage gained ↑"
+        "method", "Gaussians", "cells of 2", "PSNR, stored size ↑", "SSIM, stored size ↑", "insertion PSNR ↑", "coverage ↑",
+        "coverage gained ↑"
     ]  # fmt: skip
     assert lines == [
         ["before the insertion, captured photos only", "fitted", "2", "25.50", "0.500", "–", "0.600", "–"],
@@ -78,7 +79,7 @@ def test_a_method_that_could_not_be_run_has_its_reason_in_the_line() -> None:
     lost = UnavailableRow(scene="a", round=1, method="ttt3r", model="ttt3r", seed=0, reason=reason)
     rows = [row("a", "captured", 25.0), row("b", "captured", 15.0), lost, row("b", "omnivggt", 12.0)]
     header, *lines = cells(comparison_table(rows).csv())
-    assert header == ["method", "Gaussians", "cells of 2", "PSNR ↑", "SSIM ↑"]
+    assert header == ["method", "Gaussians", "cells of 2", "PSNR, stored size ↑", "SSIM, stored size ↑"]
     assert lines[1:] == [
         ["OmniVGGT (pixel-aligned Gaussians)", "as predicted", "1", "12.00 (1/2)", "0.500 (1/2)"],
         ["TTT3R (pixel-aligned Gaussians)", "–", "0", reason, "–"],
@@ -119,7 +120,7 @@ def test_gaps_are_shown_not_averaged_over() -> None:
     ]
     header, *lines = cells(comparison_table(rows).csv())
     table = {line[0].split()[0]: dict(zip(header, line, strict=True)) for line in lines}
-    assert table["before"]["PSNR ↑"] == "20.00 (2/3)"
+    assert table["before"]["PSNR, stored size ↑"] == "20.00 (2/3)"
     assert table["before"]["coverage ↑"] == "0.500 (1/3)"
     assert table["before"]["depth AbsRel ↓"] == "missing"
     assert table["SceneExpander"]["cells of 3"] == "1"

@@ -24,9 +24,10 @@ from sceneexpander.expandbench.table import (
     seed_spread,
 )
 
-PSNR = COLUMNS[0]
+PSNR = next(column for column in COLUMNS if column.name == "psnr_db")
 DEPTH = next(column for column in COLUMNS if column.name == "depth_abs_rel")
 NUMBERS = BenchNumbers(
+    own_psnr_db=19.0, own_open_share=0.0,
     psnr_db=20.0, ssim=0.8, st_lpips=0.01, others_psnr_db=19.0, camera_rotation_deg=0.1, camera_direction_deg=0.2, depth_abs_rel=0.05,
     inserted_psnr_db=25.0, inserted_rotation_deg=1.0, inserted_direction_deg=2.0, new_psnr_db=15.0, new_coverage=0.9,
     new_depth_abs_rel=0.2, between_psnr_db=17.0,
@@ -38,7 +39,7 @@ def cell(
 ) -> CellResult:
     return CellResult(
         scene=scene, grade=grade, row=row, seed=seed, steps=0, seconds=0.0, code="c",
-        numbers=replace(NUMBERS, psnr_db=psnr, depth_abs_rel=depth),
+        numbers=replace(NUMBERS, psnr_db=psnr, own_psnr_db=psnr, depth_abs_rel=depth),
     )  # fmt: skip
 
 
@@ -125,8 +126,8 @@ def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
 
 def test_the_tables_say_so() -> None:
     text = main_table(CELLS)
-    assert "| full | 4 | 21.70 ± 0.35 |" in text
-    assert "| captured | 4 | 22.10 ± 0.14 |" in text
+    assert "| full | 4 | 21.70 ± 0.35 | 0.000 ± 0.000 | 21.70 ± 0.35 |" in text
+    assert "| captured | 4 | 22.10 ± 0.14 | 0.000 ± 0.000 | 22.10 ± 0.14 |" in text
     curve = curve_table(CELLS, ["full"])
     assert "| mixed_1 | -0.90 ± 0.14 (worst -0.90; 0/2) | +0.50 ± 0.07 (worst -0.30; 1/2) |" in curve
 

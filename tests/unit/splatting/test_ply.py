@@ -270,3 +270,28 @@ def test_a_count_that_no_file_holds_is_one_line(tmp_path: Path, encoding: str, e
 def test_a_name_that_is_no_file_is_one_line(tmp_path: Path, name: str) -> None:
     with pytest.raises(UserError):
         read_ply(tmp_path / name)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_how_opacities_are_meant_travels_with_the_file(tmp_path: Path, antialiased: bool) -> None:
+    write_ply(replace(random_gaussians(5), antialiased=antialiased), tmp_path / "a.ply")
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)[0].decode()
+    # The spelling that gsplat, nerfstudio, Brush and splat-transform share.
+    assert f"comment SplatRenderMode: {'mip' if antialiased else 'default'}" in header.splitlines()
+    assert read_ply(tmp_path / "a.ply").antialiased is antialiased
+
+
+@pytest.mark.parametrize(
+    ("comment", "antialiased"),
+    [
+        ("SplatRenderMode: mip", True),
+        ("SplatRenderMode: default", False),
+        ("antialiased 1", True),
+        ("made by me", False),
+    ],
+)
+def test_other_programs_say_it_in_their_own_words(tmp_path: Path, comment: str, antialiased: bool) -> None:
+    foreign_file(tmp_path / "a.ply", random_gaussians(5), LAYOUTS["gsplat"], "binary_little_endian")
+    raw = (tmp_path / "a.ply").read_bytes().replace(b"comment made elsewhere", f"comment {comment}".encode())
+    (tmp_path / "a.ply").write_bytes(raw)
+    assert read_ply(tmp_path / "a.ply").antialiased is antialiased

@@ -221,3 +221,10 @@ def test_few_bytes_that_stand_for_very_many_gaussians_are_refused_before_they_ar
 def test_a_name_that_is_no_file_is_one_line(tmp_path: Path, name: str) -> None:
     with pytest.raises(UserError):
         read_spz(tmp_path / name)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_how_opacities_are_meant_is_the_first_flag(tmp_path: Path, antialiased: bool) -> None:
+    write_spz(replace(bounded(5), antialiased=antialiased), tmp_path / "a.spz")
+    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[14] == int(antialiased)
+    assert read_spz(tmp_path / "a.spz").antialiased is antialiased

@@ -21,6 +21,9 @@ SPLAT_RESIDUALS = 4  # log scale along the slant, log scale across, opacity logi
 _OPACITY_RANGE = (0.01, 0.97)  # of the analytic opacity, so that its logit stays finite
 _SNAP_ROUNDS = 3
 _SNAP_STEP = 0.08  # range of log depth within 3x3 pixels from which on it is an edge and not a slanted surface
+_LOG_SCALE_LIMIT = (
+    2.0  # Gaussians may get wider than the rule makes them, not narrower: at a larger size a surface would fall apart
+)
 _OFFSET_LIMIT = 0.05  # the learned offset moves a Gaussian by 5 % of its depth at most
 
 
@@ -42,6 +45,7 @@ def pixel_aligned_gaussians(
     Cameras and normals receive no gradient from here.
     """
     log_scale, opacity_logit, offset = residuals[:, :2], residuals[:, 2], residuals[:, 3]
+    learned = log_scale.clamp(0, _LOG_SCALE_LIMIT).exp().movedim(1, -1)
     splat_depth = snap_to_surfaces(depth) * (_OFFSET_LIMIT * torch.tanh(offset)).exp()
     analytic = pixel_aligned(
         images=images,
@@ -51,13 +55,12 @@ def pixel_aligned_gaussians(
         intrinsics_px=intrinsics_px,
         normals=normals,
         generated=generated,
+        scale_factors=functional.pad(learned, (0, 1), value=1.0),
         rule=SplatRule(std_px=config.splat_std_px, max_stretch=config.max_stretch, thickness=config.splat_thickness),
     )
     base_logit = torch.logit((analytic.opacities * (1 - transparent.flatten())).clamp(*_OPACITY_RANGE))
-    learned = log_scale.clamp(-2, 2).exp().movedim(1, -1).flatten(0, 2)
     gaussians = replace(
         analytic,
-        scales=analytic.scales * functional.pad(learned, (0, 1), value=1.0),
         opacities=torch.sigmoid(base_logit + opacity_logit.flatten()),
     )
     return gaussians, splat_depth

@@ -3,7 +3,7 @@
 const facts = JSON.parse(document.getElementById("facts").textContent);
 const $ = (id) => document.getElementById(id);
 const canvas = $("scene");
-const MIN_ALPHA = 1 / 255, MAX_ALPHA = 0.99, BLUR = 0.3, NEAR = 0.01, MARGIN = 0.15;  // of the project's rasteriser
+const MIN_ALPHA = 1 / 255, MAX_ALPHA = 0.99, BLUR = 0.3, LEAST_COMPENSATION = 0.005, NEAR = 0.01, MARGIN = 0.15;  // of the project's rasteriser
 const TEXELS = 1024;  // width of the data texture, two texels per splat
 const CAPTURED = [0.38, 0.74, 0.76], GENERATED = [1.0, 0.61, 0.32];
 
@@ -17,6 +17,7 @@ uniform vec2 size;
 uniform vec4 tint;        // colour, strength
 uniform float opacity;
 uniform vec2 logScale;    // of byte 0, of byte 255
+uniform bool compensate;  // opacities for the blur
 layout(location = 0) in uint index;
 out vec2 offset;          // standard deviations from the centre
 flat out vec4 shade;
@@ -42,7 +43,7 @@ void main() {
   uvec4 form = texelFetch(splats, ivec2((at + 1) % ${TEXELS}, (at + 1) / ${TEXELS}), 0);
   vec3 p = turn * uintBitsToFloat(place.xyz) + shift;
   float a = opacity * float(place.w >> 24) / 255.0;
-  if (p.z <= ${NEAR} || a < ${MIN_ALPHA}) return;
+  if (p.z <= ${NEAR}) return;
   vec2 low = -(lens.zw + ${MARGIN} * size) / lens.xy, high = (size - lens.zw + ${MARGIN} * size) / lens.xy;
   vec2 ratio = p.xy / p.z, held = clamp(ratio, low, high);
   vec3 bytes = vec3(float(form.y & 255u), float((form.y >> 8) & 255u), float((form.y >> 16) & 255u)) / 255.0;
@@ -55,6 +56,11 @@ void main() {
     sy[i] = lens.y * (axis.y - held.y * axis.z) / p.z;
   }
   float xx = dot(sx, sx) + ${BLUR}, xy = dot(sx, sy), yy = dot(sy, sy) + ${BLUR};
+  if (compensate) {
+    vec3 area = cross(sx, sy);  // its square is the determinant before the blur
+    a *= max(${LEAST_COMPENSATION}, sqrt(dot(area, area) / (xx * yy - xy * xy)));
+  }
+  if (a < ${MIN_ALPHA}) return;
   float middle = 0.5 * (xx + yy), apart = sqrt(max(0.0, 0.25 * (xx - yy) * (xx - yy) + xy * xy));
   vec2 first = abs(xy) > 1e-6 ? normalize(vec2(xy, middle + apart - xx)) : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
   vec2 spread = sqrt(vec2(middle + apart, max(middle - apart, 0.01)));
@@ -274,6 +280,7 @@ function drawSplats(method, lens, rows, shift, size) {
   gl.uniform4fv(places.tint, [...facts.tint.slice(0, 3), state.tint ? facts.tint[3] : 0]);
   gl.uniform1f(places.opacity, state.opacity);
   gl.uniform2fv(places.logScale, method.log_scale);
+  gl.uniform1i(places.compensate, method.antialiased ? 1 : 0);
   gl.bindVertexArray(splatArray);
   gl.bindBuffer(gl.ARRAY_BUFFER, orderBuffer);
   gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);

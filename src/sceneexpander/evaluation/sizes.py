@@ -1,0 +1,93 @@
+"""How a reconstruction holds when its pictures are drawn at other sizes than the one it was made from.
+
+A splat scene can show its photos perfectly at one size and be dust at every other: Gaussians narrower than a pixel are widened by the
+rasteriser's blur there, and leave gaps as soon as the same pixel becomes four. People look at scenes in windows of any size.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from sceneexpander.artifacts.metrics import SIZES, SizeMetrics
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.image import WINDOW, psnr, ssim
+from sceneexpander.evaluation.perceptual import st_lpips
+from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.splatting import render
+
+OPEN_ALPHA = 0.9  # below it one looks through a surface
+PSNR_CAP_DB = 100.0
+_LEAST_SIDE_PX = 28  # smaller pictures vanish inside the network of ST-LPIPS
+_TIMES = {"half": 0.5, "double": 2.0, "quadruple": 4.0}
+
+
+@torch.no_grad()
+def at_sizes(
+    reconstruction: Reconstruction,
+    index: int,
+    photo: Float[Tensor, "3 photo_height photo_width"],
+    valid: Bool[Tensor, "height width"] | None,
+    config: EvaluateConfig,
+    names: tuple[str, ...] = SIZES,
+) -> dict[str, SizeMetrics]:
+    """One view of a reconstruction at sizes by name (`SIZES`), on black. Sizes too small to compare are left out.
+
+    Args:
+        reconstruction: what is drawn.
+        index: of the view in it.
+        photo: the view's picture in its own pixels.
+        valid: stored pixels that show the place; None: all.
+        config: settings.
+        names: of the sizes.
+    """
+    stored = tuple(int(side) for side in reconstruction.depth.shape[1:])
+    found = {}
+    for name in names:
+        size = (int(photo.shape[1]), int(photo.shape[2])) if name == "own" else _times(stored, _TIMES[name])
+        if min(size) >= WINDOW:
+            found[name] = _at_size(reconstruction, index, photo, valid, size, config)
+    return found
+
+
+def _times(stored: tuple[int, ...], factor: float) -> tuple[int, int]:
+    height, width = stored
+    return round(height * factor), round(width * factor)
+
+
+def _at_size(
+    reconstruction: Reconstruction,
+    index: int,
+    photo: Float[Tensor, "3 photo_height photo_width"],
+    valid: Bool[Tensor, "height width"] | None,
+    size: tuple[int, int],
+    config: EvaluateConfig,
+) -> SizeMetrics:
+    stored_height, stored_width = reconstruction.depth.shape[1:]
+    height, width = size
+    lens = resize_intrinsics(reconstruction.intrinsics_px[index], width / stored_width, height / stored_height)
+    seen = render(reconstruction.gaussians, reconstruction.world_from_cam[index][None], lens[None], height, width)
+    shown = None
+    if valid is not None:
+        shown = functional.interpolate(valid[None, None].to(photo), size=size, mode="nearest")[0, 0] > 0
+    through = seen.alpha[0] < OPEN_ALPHA
+    open_share = float((through if shown is None else through[shown]).double().mean())
+    if height > photo.shape[1] or width > photo.shape[2]:
+        return SizeMetrics(open_share=open_share)
+    wanted = photo
+    if size != tuple(photo.shape[1:]):
+        wanted = functional.interpolate(photo[None], size=size, mode="bicubic", antialias=True)[0].clamp(0, 1)
+    picture = seen.rgb[0]
+    perceptual = None
+    if config.st_lpips and min(size) >= _LEAST_SIDE_PX:
+        everywhere = 1.0 if shown is None else shown
+        perceptual = st_lpips(picture * everywhere, wanted * everywhere)
+    return SizeMetrics(
+        open_share=open_share,
+        psnr_db=min(psnr(picture, wanted, shown), PSNR_CAP_DB),
+        ssim=ssim(picture, wanted, shown),
+        st_lpips=perceptual,
+    )
