@@ -22,8 +22,9 @@ repro: .venv/.stamp ## Run the pipeline on the scenes in params.yaml
 
 setup: .venv/.stamp ## Make .venv from requirements.lock
 
-# The lock is installed as it is; the package itself without dependencies (it builds an optional extension).
-.venv/.stamp: requirements.lock requirements-nodeps.lock pyproject.toml
+# The lock is installed as it is; the package itself without dependencies (it builds an optional extension, from KERNEL).
+KERNEL := $(addprefix src/sceneexpander/splatting/kernel/,rasteriser.cpp recipe.py)
+.venv/.stamp: requirements.lock requirements-nodeps.lock pyproject.toml setup.py $(KERNEL)
 	test -x $(PY) || $(PYTHON) -m venv .venv
 	$(PY) -m pip install --quiet --no-compile -r requirements.lock
 	$(PY) -m pip install --quiet --no-compile --no-deps -r requirements-nodeps.lock

@@ -70,7 +70,8 @@ class SourceTree:
             digest.update(f"{name}\n{meaning(path)}\n".encode())
             if path.parent not in self.packages.values() or path.name != "__init__.py":
                 folders.add(path.parent)
-        for asset in sorted({asset for folder in folders for asset in _assets(folder)}):
+        roots = set(self.packages.values())
+        for asset in sorted({asset for folder in folders for asset in _assets(folder, whole=folder not in roots)}):
             digest.update(f"{self._label(asset)}\n".encode())
             digest.update(hashlib.sha256(asset.read_bytes()).digest())
         return digest.hexdigest()
@@ -146,12 +147,16 @@ def _declared_imports(tree: ast.Module) -> Sequence[str] | None:
     return None
 
 
-def _assets(folder: Path) -> Iterator[Path]:
-    """Data files of a package folder and of its sub-folders that hold no Python (those are packages of their own)."""
+def _assets(folder: Path, *, whole: bool) -> Iterator[Path]:
+    """Data files of a package folder and of its sub-folders.
+
+    Sub-folders that hold Python are packages of their own. With ``whole`` their data counts all the same, imported or not: what lies in
+    a room may be read by any of its modules.
+    """
     for path in sorted(folder.iterdir()):
         if path.name.startswith((".", "__pycache__")):
             continue
         if path.is_file() and path.suffix not in _IGNORED_SUFFIXES:
             yield path
-        elif path.is_dir() and not any(path.rglob("*.py")):
-            yield from _assets(path)
+        elif path.is_dir() and (whole or not any(path.rglob("*.py"))):
+            yield from _assets(path, whole=whole)
