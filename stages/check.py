@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sceneexpander.config.overrides import written_out
 from sceneexpander.errors import entry_point
+from sceneexpander.packages import installed_packages
 from sceneexpander.preflight import check_scene
 from sceneexpander.selection import read_selection
 from stages import layout
@@ -15,6 +16,7 @@ from stages.resolve import CONF
 @entry_point
 def main() -> None:
     """Raise the first problem as one line."""
+    installed_packages(Path())
     selection = read_selection(Path())
     for scene in selection.scenes:
         check_scene(

@@ -13,6 +13,7 @@ OUTPUTS = Path("outputs")
 PAGES = OUTPUTS / "pages"  # what is shown of every scene, gathered from its artefacts
 REPORT = OUTPUTS / "report"
 CODE = OUTPUTS / "code.json"
+ENVIRONMENT = OUTPUTS / "environment.json"  # that the hashes in CODE belong to
 REPEATS = "repeat_*"
 REFINEMENT = "refinement.json"  # beside a reconstruction whose Gaussians were refined: what it changed
 
@@ -30,6 +31,14 @@ def config(scene: str) -> Path:
 def selection(scene: str) -> Path:
     """Which methods params.yaml asks for: one key per method that is not always made."""
     return OUTPUTS / scene / "methods.yaml"
+
+
+def given(scene: str, kind: str) -> Path:
+    """A folder of links to files that the configuration names, wherever they are: the pipeline depends on their bytes.
+
+    ``kind``: ``picture`` (a link per round), ``model`` (weights), or a rival's name (weights).
+    """
+    return OUTPUTS / "given" / scene / kind
 
 
 def prepared(scene: str) -> Path:

@@ -10,7 +10,8 @@ from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import ModelConfig, captured_prediction, load_model, refined
 from sceneexpander.optimisation.refine import RefineConfig
 from stages import layout
-from stages.runner import Cell, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,7 +29,7 @@ class Sections:
 def main(cell: Cell) -> None:
     """Predict all views so far, without augmentation, with the weights before the round."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
     anchors, reconstruction = captured_prediction(state, load_model(sections.model, sections.device))
     reconstruction, fit = refined(

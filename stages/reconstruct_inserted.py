@@ -12,7 +12,8 @@ from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_mode
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.optimisation.refine import RefineConfig
 from stages import layout
-from stages.runner import Cell, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +32,7 @@ class Sections:
 def main(cell: Cell) -> None:
     """Cameras and depth of all views together, and the scene the unadapted model makes of them."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
     inserted = InsertedView.load(layout.inserted(cell.scene, cell.round))
     loaded = load_model(sections.model, sections.device)

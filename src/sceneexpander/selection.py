@@ -22,7 +22,9 @@ RIVALS = ("omnivggt", "ttt3r")  # networks of others
 SPLATTED = "gaussian_splatting"  # per-scene optimisation, started from the backbone
 OPTIMISABLE = ("sceneexpander", *RIVALS)  # what an optimisation after the fact can start from
 METHODS = (*OURS, SPLATTED, *RIVALS, *(f"{method}_optimised" for method in OPTIMISABLE))
-RESERVED = frozenset({"pages", "report", "code.json"})  # in outputs/, where every scene has a folder of its name
+RESERVED = frozenset(
+    {"pages", "report", "given", "code.json", "environment.json"}
+)  # in outputs/, where every scene has a folder of its name
 MOST_ROUNDS = 100
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 _KEYS = ("scenes", "rounds", "methods", "overrides")

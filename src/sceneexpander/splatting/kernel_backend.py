@@ -57,7 +57,7 @@ class _Kernel:
 
     def __init__(self, path: Path, build: str) -> None:
         library = ctypes.CDLL(str(path))
-        self.path = path
+        self.path, self.build = path, build
         _require_own_source(library, path, build)
         if library.sx_abi_version() != ABI_VERSION:
             raise OSError(f"{path.name} has ABI {library.sx_abi_version()}, expected {ABI_VERSION}: install again")
@@ -110,6 +110,12 @@ def load_kernel() -> _Kernel | None:
         "rasteriser: no compiled kernel beside the package, using torch (slower); install again with a C++ compiler"
     )
     return None
+
+
+def kernel_build() -> str:
+    """Which build of the kernel draws on this machine (a name in `BUILDS`); "torch" where none does."""
+    kernel = load_kernel()
+    return "torch" if kernel is None else kernel.build
 
 
 def open_build(build: str) -> _Kernel | None:
