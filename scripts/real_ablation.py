@@ -29,10 +29,10 @@ from sceneexpander.expansion import (
     joint_reconstruction,
     refined,
 )
-from sceneexpander.expansion.loaded import load_model
 from sceneexpander.generation import generate_inserted_view
 from sceneexpander.ingest import load_scene
 from sceneexpander.project import find_project
+from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 
 

@@ -11,6 +11,8 @@ __all__ = ["METHODS", "OPTIMISABLE", "OURS", "RIVALS", "SPLATTED"]
 SCENES = Path("scenes")
 OUTPUTS = Path("outputs")
 PAGES = OUTPUTS / "pages"  # what is shown of every scene, gathered from its artefacts
+PAGE_CONFIG = "config.yaml"  # in a scene's folder of PAGES: its composed configuration
+PAGE_GAUSSIANS = "gaussians.json"  # there as well: hashes of the Gaussians' files, which are too large to be gathered
 REPORT = OUTPUTS / "report"
 CODE = OUTPUTS / "code.json"
 ENVIRONMENT = OUTPUTS / "environment.json"  # that the hashes in CODE belong to
@@ -89,6 +91,11 @@ def joint_priors(scene: str, number: int) -> Path:
 def renders(scene: str, number: int, method: str) -> Path:
     """Videos and pictures of a method's reconstruction."""
     return round_folder(scene, number) / "renders" / method
+
+
+def gaussians(scene: str, number: int, method: str) -> Path:
+    """A method's Gaussians as PLY."""
+    return renders(scene, number, method) / "gaussians.ply"
 
 
 def packed(scene: str, number: int, method: str) -> Path:

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from sceneexpander.artifacts.state import ExpansionState
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, captured_prediction, load_model, refined
 from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+from sceneexpander.reconstruction.refining import refined
+from sceneexpander.reconstruction.views import captured_prediction
 from stages import layout
 from stages.machine import use_machine
 from stages.runner import Cell, stage

@@ -8,9 +8,11 @@ from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, initial_state, load_model, report_cameras
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.progress import progress_bar
+from sceneexpander.reconstruction.cameras import report_cameras
+from sceneexpander.reconstruction.initial import initial_state
+from sceneexpander.reconstruction.loaded import ModelConfig, load_model
 from stages import layout
 from stages.machine import use_machine
 from stages.runner import Cell, stage

@@ -8,9 +8,12 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.state import ExpansionState, save_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_model, refined, report_cameras
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.reconstruction.cameras import report_cameras
+from sceneexpander.reconstruction.fitting import fitted
+from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+from sceneexpander.reconstruction.views import joint_reconstruction
 from stages import layout
 from stages.machine import use_machine
 from stages.runner import Cell, stage
@@ -39,11 +42,10 @@ def main(cell: Cell) -> None:
     priors, reconstruction, sparse = joint_reconstruction(
         state, inserted, loaded, sections.frontend, seed=sections.seed
     )
-    reconstruction, fit = refined(
+    reconstruction, fit = fitted(
         reconstruction,
         state.views.append(inserted.view),
         sections.refine,
-        doubt_generated=False,
         seed=sections.seed,
         device=sections.device,
     )

@@ -34,6 +34,7 @@ from sceneexpander.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
 from stages import layout
 
 STAGE_ENV = "DVC_STAGE"  # set by DVC for the commands that it runs
+UNFINISHED_KEPT = 20  # interrupted works whose resume points stay, the latest first
 LIVE_KEPT = 20  # adaptations whose logs and pictures stay, the latest first
 
 _log = logging.getLogger(__name__)
@@ -71,6 +72,7 @@ def checkpoint_folder(run: RunIdentity) -> Path:
     """Where unfinished work of this identity keeps its resume points. What other code left of the same work is said and deleted."""
     folder = project_root() / ".cache" / "ckpt" / run.work
     own = folder / run.code[:32]
+    keep_newest(folder.parent, UNFINISHED_KEPT - 1, beside=folder)
     for other in sorted(folder.iterdir()) if folder.is_dir() else ():
         if other != own:
             _log.warning(

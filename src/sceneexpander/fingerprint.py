@@ -8,6 +8,7 @@ count.
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -84,7 +85,7 @@ class SourceTree:
 
     def _imports(self, module: str, path: Path) -> Iterator[str]:
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-        tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+        tree = _parsed(path.read_text(encoding="utf-8"), str(path))
         declared = _declared_imports(tree)
         yield from declared or ()
         for node in ast.walk(tree):
@@ -108,7 +109,18 @@ class SourceTree:
 
 def meaning(path: Path) -> str:
     """The syntax tree of a Python file as text, without docstrings, comments and positions."""
-    tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+    return _meaning(path.read_text(encoding="utf-8"), str(path))
+
+
+# Stages share most of their modules.
+@functools.lru_cache(maxsize=1024)
+def _parsed(text: str, name: str) -> ast.Module:
+    return ast.parse(text, filename=name)
+
+
+@functools.lru_cache(maxsize=1024)
+def _meaning(text: str, name: str) -> str:
+    tree = ast.parse(text, filename=name)
     for node in ast.walk(tree):
         if isinstance(node, _DOCUMENTED) and node.body and _is_docstring(node.body[0]):
             node.body = node.body[1:] or [ast.Pass()]

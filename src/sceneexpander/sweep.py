@@ -17,7 +17,7 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.overrides import environment_hidden, key_of, written_out
 from sceneexpander.config.parse import ConfigError
 from sceneexpander.errors import UserError, did_you_mean, disk_full, entry_point
-from sceneexpander.preflight import check_scene
+from sceneexpander.preflight import Checked, check_scene
 from sceneexpander.processes import run_group
 from sceneexpander.project import ROOT_ENV, find_project
 from sceneexpander.selection import read_selection
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 INNER_ENV = "SCENEEXPANDER_SWEEP_RUNS"  # set in the process that runs Hydra, which ends with the one that the user sees
 MOST_VALUES = 1000  # of one key: each is a run of its own
 KEPT = ("outputs/report", "outputs/pages", "params.yaml", "dvc.lock")  # of a finished job; the rest is in the cache
+_CHECKED = Checked()  # by the jobs that this process has run
 
 
 def run_job(folder: Path, overrides: tuple[str, ...], project: Path, *, sweep: str | None = None) -> None:
@@ -49,6 +50,7 @@ def run_job(folder: Path, overrides: tuple[str, ...], project: Path, *, sweep: s
                 overrides=selection.overrides,
                 rounds=selection.rounds,
                 methods=selection.methods,
+                checked=_CHECKED,
             )
         workspace = make_workspace(folder / "workspace", selection, project=project)
         reproduce_shared(workspace, project=project, sweep=sweep)

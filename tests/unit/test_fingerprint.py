@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -111,3 +113,30 @@ def test_the_rasterisers_source_and_flags_are_code_of_all_that_render(tmp_path: 
         source.write_text(source.read_text().replace("1e-4f", "2e-4f").replace('"-O3"', '"-O2"'))
         changed = {stage for stage in stages if ours.fingerprint(f"stages.{stage}") != before[stage]}
         assert changed == set(stages) - {"prepare"}
+
+
+def test_an_edit_of_the_adaptation_reruns_no_reconstructor() -> None:
+    root = Path(__file__).parents[2]
+    ours = SourceTree(packages={"sceneexpander": root / "src" / "sceneexpander", "stages": root / "stages"})
+
+    def adaptation(stage: str) -> set[str]:
+        room = "sceneexpander.adaptation"
+        return {
+            name.removeprefix(f"{room}.") for name in ours.closure(f"stages.{stage}") if name.startswith(f"{room}.")
+        }
+
+    # What they run of that room themselves, and no more: the warm-up, and the trust in pictures inserted before.
+    assert adaptation("reconstruct") == {"warmup", "photometric"}
+    assert adaptation("precompute_anchors") == {"consistency"}
+    assert adaptation("reconstruct_inserted") == set()
+    assert adaptation("rival") == set()
+    assert "loop" in adaptation("adapt")
+
+
+@pytest.mark.parametrize("stage", ["prepare", "generate_view", "reconstruct_inserted", "evaluate", "track"])
+def test_what_a_stage_imports_is_in_its_closure(stage: str) -> None:
+    root = Path(__file__).parents[2]
+    ours = SourceTree(packages={"sceneexpander": root / "src" / "sceneexpander", "stages": root / "stages"})
+    program = f"import stages.{stage}, sys; print(*(n for n in sys.modules if n.split('.')[0] in ('sceneexpander', 'stages')))"
+    done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) <= set(ours.closure(f"stages.{stage}"))

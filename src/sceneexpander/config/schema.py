@@ -10,7 +10,6 @@ from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
-from sceneexpander.expansion import ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import GeneratorConfig
 from sceneexpander.inference.config import RivalsConfig
@@ -18,6 +17,7 @@ from sceneexpander.ingest import IngestConfig
 from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.optimisation.refine import RefineConfig
 from sceneexpander.ranges import Range, check_ranges
+from sceneexpander.reconstruction.loaded import ModelConfig
 from sceneexpander.rendering import RenderConfig
 from sceneexpander.tracking import TrackingConfig
 from sceneexpander.typed import shorten

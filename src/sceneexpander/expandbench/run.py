@@ -19,18 +19,20 @@ from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import WeightsChange
-from sceneexpander.artifacts.store import read_json, to_plain, write_json_atomic
+from sceneexpander.artifacts.store import keep_newest, read_json, to_plain, write_json_atomic
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.measure import BenchNumbers, measure
 from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.scenes import BenchScene, build_scene
 from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model, refined
-from sceneexpander.expansion.rounds import RoundInputs, adapted_weights, aligned, finished_round, reconstruct
+from sceneexpander.expansion.rounds import RoundInputs, adapted_weights, aligned, finished_round
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.optimisation.refine import RefineConfig
+from sceneexpander.reconstruction.views import reconstruct
 
 CAPTURED = "captured"  # the pre-insertion scene: the ceiling of preservation
+PREPARED_KEPT = 4  # codes and configurations whose prepared scenes stay, the last used first
 BASELINE = "baseline"  # the same weights given the inserted view
 _log = logging.getLogger(__name__)
 
@@ -135,7 +137,11 @@ class _Worker:
         shared = {name: getattr(settings, name) for name in ("model", "frontend", "warmup", "refine")}
         self.shared = json.dumps(to_plain(shared), sort_keys=True)
         key = hashlib.sha256(f"{self.shared}:{settings.code if not settings.any_code else ''}".encode()).hexdigest()
-        self.folder = settings.cache / "prepared" / key[:16] / name
+        prepared = settings.cache / "prepared" / key[:16]
+        prepared.mkdir(parents=True, exist_ok=True)
+        prepared.touch()
+        keep_newest(prepared.parent, PREPARED_KEPT - 1, beside=prepared)
+        self.folder = prepared / name
         self._scene: BenchScene | None = None
         self._loaded: LoadedModel | None = None
         self._prepared: PreparedScene | None = None
