@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .ONESHELL:
 .SHELLFLAGS := -eu -o pipefail -c
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
 PY := .venv/bin/python
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 export SCENEEXPANDER_ROOT := $(CURDIR)
@@ -24,7 +24,9 @@ setup: .venv/.stamp ## Make .venv from requirements.lock
 
 # The lock is installed as it is; the package itself without dependencies (it builds an optional extension).
 .venv/.stamp: requirements.lock requirements-nodeps.lock pyproject.toml
-	test -x $(PY) || $(PYTHON) -m venv .venv
+	@test -x $(PY) || "$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo 'error: PYTHON: "$(PYTHON)" is not Python 3.11 or newer; make PYTHON=/path/to/python3.11' >&2; exit 2; }
+	test -x $(PY) || "$(PYTHON)" -m venv .venv
 	$(PY) -m pip install --quiet --no-compile -r requirements.lock
 	$(PY) -m pip install --quiet --no-compile --no-deps -r requirements-nodeps.lock
 	$(PY) -m pip install --quiet --no-compile --no-deps --no-build-isolation -e .

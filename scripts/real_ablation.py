@@ -1,7 +1,7 @@
 """Rows of the ablation on scene folders without known truth: python scripts/real_ablation.py FOLDER ... --rows full,none
 
-A folder is as in ``scenes/`` (photos in captured/, a scene.yaml whose first round names an inserted picture). Prints one line per row: what
-preservation and insertion can be measured without truth. The pre-insertion scene and the backbone are always there.
+A folder is as in ``scenes/`` (photos in captured/, a scene.yaml whose first round names an inserted picture). Prints one line per row and
+seed: what preservation and insertion can be measured without truth. The pre-insertion scene and the baseline are always there.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from sceneexpander.expansion import (
     initial_state,
     joint_reconstruction,
     refined,
+    refined_round,
 )
 from sceneexpander.expansion.loaded import load_model
 from sceneexpander.generation import generate_inserted_view
@@ -64,28 +65,24 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
     state, _, _, _ = initial_state(scene, loaded, config.frontend, config.warmup, seed=config.seed)
     anchors, captured = captured_prediction(state, loaded)
     inserted: InsertedView
-    inserted, _ = generate_inserted_view(scene, 1, state.views, folder, config.generator, seed=config.seed)
+    inserted, _ = generate_inserted_view(scene, 1, state.views, folder, config.generator)
     priors, backbone, _ = joint_reconstruction(state, inserted, loaded, config.frontend, seed=config.seed)
     inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
     views = state.views.append(inserted.view)
-    captured, _ = refined(captured, state.views, config.refine, doubt_generated=True, seed=config.seed)
-    backbone, _ = refined(backbone, views, config.refine, doubt_generated=False, seed=config.seed)
     print(
         f"{scene.name}: {len(state.views)} photos of {views.height} x {views.width}, inserted view posed: {bool(backbone.posed[-1])}"
     )
-    made = {"captured": captured, "baseline": backbone}
-    for name, reconstruction in made.items():
-        print(line(name, reconstruction, views), flush=True)
-    for row in rows:
-        adapt: AdaptConfig = replace(composed(row, overrides).adapt, checkpoint_every=0)
-        for seed in seeds:
-            state, reconstruction, _ = adapt_round(inputs, loaded, adapt, seed=seed)
+    made: dict[str, Reconstruction] = {}
+    for seed in seeds:  # of the adaptation and of the fit: lines of one seed differ in nothing but the row
+        for name, reconstruction, shown in (("captured", captured, state.views), ("baseline", backbone, views)):
+            made[name], _ = refined(reconstruction, shown, config.refine, doubt_generated=False, seed=seed)
+            print(line(f"{name} seed {seed}", made[name], views), flush=True)
+        for row in rows:
+            adapt: AdaptConfig = replace(composed(row, overrides).adapt, checkpoint_every=0)
+            expanded, reconstruction, _ = adapt_round(inputs, loaded, adapt, seed=seed)
             # Fitted to the pictures that the round worked with, and measured on the ones that were given.
-            reconstruction, _ = refined(
-                reconstruction, state.toned_views, config.refine, doubt_generated=adapt.trust, seed=seed
-            )
-            print(line(f"{row} seed {seed}", reconstruction, views), flush=True)
-        made[row] = reconstruction
+            made[row], _ = refined_round(reconstruction, expanded, adapt, config.refine, seed=seed)
+            print(line(f"{row} seed {seed}", made[row], views), flush=True)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         for name, reconstruction in made.items():

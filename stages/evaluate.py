@@ -65,14 +65,14 @@ def main(cell: Cell) -> None:
                 width=renders.width,
             ),
             truth=load_truth(layout.source(cell.scene)),
-            fit=_fit(cell),
+            fit=fit_of(cell),
         )
         for run in runs
     ]
     over_repeats(rows).save(layout.metrics(cell.scene, cell.round, cell.method))
 
 
-def _fit(cell: Cell) -> Fit:
+def fit_of(cell: Cell) -> Fit:
     """What was done to the method's Gaussians after they were predicted."""
     if cell.method in layout.OPTIMISED:
         return Fit.OPTIMISED

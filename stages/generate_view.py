@@ -18,7 +18,6 @@ from stages.runner import Cell, stage
 class Sections:
     """What this stage reads of the configuration."""
 
-    seed: int
     generator: GeneratorConfig
 
 
@@ -28,9 +27,7 @@ def main(cell: Cell) -> None:
     sections = read_sections(layout.config(cell.scene), Sections)
     scene = Scene.load(layout.prepared(cell.scene))
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
-    view, sheet = generate_inserted_view(
-        scene, cell.round, state.views, layout.source(cell.scene), sections.generator, seed=sections.seed
-    )
+    view, sheet = generate_inserted_view(scene, cell.round, state.views, layout.source(cell.scene), sections.generator)
     with directory_being_written(layout.inserted(cell.scene, cell.round)) as folder:
         view.save(folder)
         save_png(folder / "sheet.png", sheet)

@@ -1,7 +1,7 @@
 """Your own photos, one command: ``python -m sceneexpander.expand PHOTOS --inserted PICTURE --prompt "..."``.
 
 ``PHOTOS`` is a folder of photos, or a scene folder with a ``scene.yaml``. Runs unattended in ``runs/NAME`` and prints where the report is.
-The methods are those that the project selects.
+Methods and settings are those of the project's params.yaml; ``key=value`` adds to them.
 """
 
 from __future__ import annotations
@@ -17,12 +17,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 
 from sceneexpander.artifacts.store import write_bytes_atomic
+from sceneexpander.config.compose import compose
+from sceneexpander.config.parse import parse_dataclass
+from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point, printable
+from sceneexpander.generation import GeneratorConfig
 from sceneexpander.ingest import make_round, read_picture, safe_name, scene_files, survey_pictures
 from sceneexpander.plainfiles import require_folder, require_plain_file
 from sceneexpander.preflight import check_scene
@@ -32,6 +36,7 @@ from sceneexpander.report.cameras import camera_lines
 from sceneexpander.selection import Selection, check_name, read_selection
 from sceneexpander.workspace import make_workspace, merged_overrides, remove_tree, reproduce, run_lock
 
+_USAGE = 'python -m sceneexpander.expand PHOTOS --inserted PICTURE --prompt "..." (--help tells the rest)'
 SCENE_FILE = "scene.yaml"
 SOURCE_FILE = "source.json"  # in a run's folder: which photos it is of
 
@@ -49,9 +54,17 @@ class Request:
     overrides: tuple[str, ...] = ()
 
 
+class _Parser(argparse.ArgumentParser):
+    """Errors are one line like all others."""
+
+    def error(self, message: str) -> NoReturn:
+        # argparse counts any number of settings as something that is required, even though it may be none.
+        raise UserError(message.replace("photos, overrides", "PHOTOS"), where="expand", fix=_USAGE)
+
+
 def parse_arguments(arguments: Sequence[str]) -> Request:
     """The command line as a `Request`."""
-    parser = argparse.ArgumentParser(prog="python -m sceneexpander.expand", description=__doc__)
+    parser = _Parser(prog="python -m sceneexpander.expand", description=__doc__)
     parser.add_argument("photos", type=Path, help="folder of photos, or a scene folder with scene.yaml")
     parser.add_argument("--inserted", type=Path, action="append", default=[], help="picture to insert, one per round")
     parser.add_argument("--prompt", action="append", default=[], help="what to add, one per round")
@@ -74,10 +87,11 @@ def parse_arguments(arguments: Sequence[str]) -> Request:
     )
 
 
-def stage_scene(request: Request, name: str, target: Path) -> None:
+def stage_scene(request: Request, name: str, target: Path, *, max_megapixels: float = 200.0) -> None:
     """Put the scene together as a folder with ``scene.yaml``: a copy of a scene folder, or made from photos and options.
 
-    A copy holds what ``scene.yaml`` names and nothing else, as plain files that can be written.
+    A copy holds what ``scene.yaml`` names and nothing else, as plain files that can be written. Pictures to insert may have
+    ``max_megapixels``; photos are read later, under the same limit.
 
     Raises:
         UserError: the folder, a picture or an option is unusable.
@@ -114,7 +128,7 @@ def stage_scene(request: Request, name: str, target: Path) -> None:
             )
         source = request.inserted[k]
         require_plain_file(source)
-        read_picture(source, max_megapixels=200.0)
+        read_picture(source, max_megapixels=max_megapixels)
         copy = _inserted_name(k + 1, source)
         _copy(source, target / copy)
         words_of_round = {"prompt": spec.prompt, "motion": spec.motion, "object": spec.new_object}
@@ -208,17 +222,21 @@ def expand(request: Request, *, project: Path) -> Path:
     require_folder(request.photos, expected="a folder of photos")
     name = run_name(request)
     folder = project / "runs" / name
-    overrides = merged_overrides((), request.overrides)
-    methods = read_selection(project).methods
+    base = read_selection(project)
+    overrides = merged_overrides(base.overrides, request.overrides, project=project)
+    config = parse_dataclass(ProjectConfig, compose(project / "conf", overrides))
+    if request.inserted and config.generator.backend != GeneratorConfig().backend:
+        problem = f"is {config.generator.backend!r} and would take the place of --inserted"
+        raise UserError(problem, where="generator.backend", fix="leave one of them out (here or in params.yaml)")
     # The lock comes first: nothing may change in a folder that another process works on.
     with run_lock(folder) as lock:
         check_source(folder, request)
         with _scratch(folder) as scratch:
             scene = scratch / name
             with _shown_as_given(scene, request):
-                stage_scene(request, name, scene)
-                rounds = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=methods)
-            selection = Selection(scenes=(name,), rounds=rounds, methods=methods, overrides=overrides)
+                stage_scene(request, name, scene, max_megapixels=config.scene.max_megapixels)
+                rounds = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
+            selection = Selection(scenes=(name,), rounds=rounds, methods=base.methods, overrides=overrides)
             folder.mkdir(exist_ok=True)
             source = json.dumps({"photos": os.fsdecode(_identity(request)), "name": name}, indent=1)
             write_bytes_atomic(folder / SOURCE_FILE, f"{source}\n".encode())

@@ -12,11 +12,14 @@ from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation import check_truth
+from sceneexpander.evaluation.image import WINDOW
 from sceneexpander.expansion import ModelConfig, load_model
 from sceneexpander.generation import generate_inserted_view
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
 from sceneexpander.models.weights import HUB_ID
+
+CHECKED_SECTIONS = ("seed", "scene", "generator", "model", "rivals")  # of the configuration, beside the device
 
 
 def check_scene(
@@ -27,6 +30,7 @@ def check_scene(
     overrides: Sequence[str],
     rounds: int | None = None,
     methods: Sequence[str] = (),
+    device: bool = True,
 ) -> int:
     """Compose the configuration for a scene and read all of its pictures; nothing is written.
 
@@ -37,6 +41,7 @@ def check_scene(
         overrides: Hydra overrides.
         rounds: how many rounds are to run; None: all that the scene defines.
         methods: that are to run; reconstructors of others among them that have no weights will say so in their rows.
+        device: whether the device must be there; not on a machine that only hands jobs to others.
 
     Returns:
         the number of rounds.
@@ -45,12 +50,20 @@ def check_scene(
         UserError: one line about the first problem found.
     """
     config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
-    check_device(config.device)
+    if device:
+        check_device(config.device)
     scene = load_scene(folder, config.scene)
+    if min(scene.views.height, scene.views.width) < WINDOW:
+        size = f"{scene.views.width} x {scene.views.height}"
+        raise UserError(
+            f"makes pictures of {size} pixels, fewer than {WINDOW} x {WINDOW}",
+            where="scene.long_side_px",
+            fix="raise it, or use photos that are less narrow",
+        )
     count = len(scene.rounds) if rounds is None else rounds
     records = [*scene.views.records]
     for number in range(1, count + 1):
-        inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator, seed=config.seed)
+        inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator)
         records += inserted.view.records
     check_truth(folder, records)  # read by the last stages only, so a mistake in it would cost the whole run
     check_weights(config.model)

@@ -38,13 +38,15 @@ _NOT_COPIED = shutil.ignore_patterns("__pycache__", "*.pyc", "*.egg-info", ".*.p
 _LITTLE_BYTES = 1 << 20  # a disk with less than that is full
 
 
-def merged_overrides(base: Sequence[str], more: Sequence[str]) -> tuple[str, ...]:
-    """``base`` followed by ``more``; of several overrides of one key the last stands. Paths of files become absolute.
+def merged_overrides(base: Sequence[str], more: Sequence[str], *, project: Path) -> tuple[str, ...]:
+    """``base``, of the project's params.yaml, followed by ``more``; of several overrides of one key the last stands.
 
-    A workspace runs in a folder of its own, where a path relative to the user's would name nothing.
+    Paths of files become absolute: those of ``base`` are relative to the project, those of ``more`` to the current folder. A workspace
+    runs in a folder of its own, where neither would name anything.
     """
-    by_key = {key_of(override): override for override in (*base, *more)}
-    return written_out(tuple(by_key.values()), absolute=True)
+    own = written_out(base, absolute=True, folder=project)
+    by_key = {key_of(override): override for override in (*own, *written_out(more, absolute=True))}
+    return tuple(by_key.values())
 
 
 def make_workspace(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -22,6 +23,7 @@ from PIL import Image
 from sceneexpander import expand as command
 from sceneexpander.errors import UserError, printable
 from sceneexpander.expand import Request, expand, run_name, stage_scene
+from sceneexpander.selection import read_selection
 from sceneexpander.workspace import run_lock
 
 ROOT = Path(__file__).parents[2]
@@ -50,9 +52,10 @@ def scene(folder: Path) -> Path:
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A project whose pipeline does nothing, and whose check looks at the folder only."""
     folder = tmp_path / "project"
-    for part in ("conf", "src", "stages", ".dvc"):
+    for part in ("src", "stages", ".dvc"):
         (folder / part).mkdir(parents=True)
         (folder / part / "file").write_text("x")
+    shutil.copytree(ROOT / "conf", folder / "conf")
     (folder / "params.yaml").write_text((ROOT / "params.yaml").read_text())
     monkeypatch.setattr(command, "check_scene", lambda *_, **__: 1)
     monkeypatch.setattr(command, "reproduce", lambda *_, **__: None)
@@ -312,11 +315,9 @@ def test_errors_name_the_users_files(project: Path, tmp_path: Path, monkeypatch:
 
 
 def test_a_full_disk_leaves_the_earlier_run(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import shutil
-
     source = photos(tmp_path / "photos")
     expand(request(source, tmp_path), project=project)
-    before = everything(project / "runs")
+    before = everything(project / "runs" / "photos")
 
     def full(_: Any, target: Any, **__: object) -> None:
         Path(target).write_bytes(b"half")
@@ -325,5 +326,57 @@ def test_a_full_disk_leaves_the_earlier_run(project: Path, tmp_path: Path, monke
     monkeypatch.setattr(shutil, "copyfile", full)
     with pytest.raises(OSError, match="No space left"):
         expand(request(source, tmp_path), project=project)
-    assert everything(project / "runs") == before
+    assert everything(project / "runs" / "photos") == before
+    assert not list((project / "runs").glob("*.part"))
     assert json.loads((project / "runs" / "photos" / "source.json").read_text())["photos"] == str(source)
+
+
+def test_a_run_has_the_projects_methods_and_settings(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a sweep's jobs do: what params.yaml says, and what was asked for on top of it."""
+    (project / "weights.safetensors").write_bytes(b"x")
+    (project / "params.yaml").write_text(
+        "scenes: [courtyard]\nrounds: [{k: 1, prev: 0}]\nmethods: [captured, omnivggt]\n"
+        "overrides: [seed=3, adapt.steps=7, rivals.omnivggt.weights=weights.safetensors]\n"
+    )
+    checked: list[dict[str, Any]] = []
+    monkeypatch.setattr(command, "check_scene", lambda *_, **given: checked.append(given) or 1)
+    monkeypatch.chdir(tmp_path)  # relative paths of params.yaml are the project's
+    expand(request(photos(tmp_path / "photos"), tmp_path, overrides=("adapt.steps=9",)), project=project)
+    selection = read_selection(project / "runs" / "photos")
+    assert selection.methods == ("captured", "omnivggt")
+    weights = project / "weights.safetensors"
+    assert selection.overrides == ("seed=3", "adapt.steps=9", f"rivals.omnivggt.weights={weights}")
+    assert checked[0]["overrides"] == selection.overrides
+    assert checked[0]["methods"] == selection.methods
+
+
+def test_a_picture_named_twice_is_refused(project: Path, tmp_path: Path) -> None:
+    """The project's own picture must not stand in for the one that was given."""
+    params = project / "params.yaml"
+    params.write_text(params.read_text().replace("overrides: []", "overrides: [generator=file, generator.file=x.png]"))
+    with pytest.raises(UserError, match=r"generator.backend: is 'file' and would take the place of --inserted"):
+        expand(request(photos(tmp_path / "photos"), tmp_path), project=project)
+    assert not (project / "runs").exists()
+
+
+def test_a_picture_may_be_as_large_as_the_photos_may(project: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="megapixels"):
+        expand(
+            request(photos(tmp_path / "photos"), tmp_path, overrides=("scene.max_megapixels=0.001",)), project=project
+        )
+
+
+@pytest.mark.parametrize("arguments", [[], ["--prompt", "A bench."], ["a", "--nope"]])
+def test_what_is_missing_is_one_line_that_says_so(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["expand", *arguments])
+    with pytest.raises(SystemExit) as caught:
+        command.main()
+    assert caught.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--inserted PICTURE" in line
+    assert "overrides" not in line
+    assert "PHOTOS" in line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from sceneexpander import ablation, sweep, ui
 from sceneexpander.errors import UserError
 from sceneexpander.expandbench.run import CellResult, Plan, Settings
+from sceneexpander.selection import Selection
 from sceneexpander.sweep import check_axes, run_hydra
 
 ROOT = Path(__file__).parents[2]
@@ -35,7 +37,18 @@ ROOT = Path(__file__).parents[2]
         (["--multirun", "seed=range(0,3,0)"], "step is 0"),
         (["--multirun", "adapt.steps=interval(1,2)"], "is a range without steps"),
         (["hydra.nope=1"], "hydra.nope"),
-        (["hydra/launcher=nope"], "hydra/launcher"),
+        (["hydra.sweep.dirr=x"], "did you mean 'hydra.sweep.dir'?"),
+        (["hydra.launcher.n_job=2", "hydra/launcher=parallel"], "did you mean 'hydra.launcher.n_jobs'?"),
+        (["hydra/launcher=paralel"], "did you mean 'parallel'?"),
+        (["hydra/launchr=serial"], "did you mean 'hydra/launcher'?"),
+        (["--multirun", "ablatoin=full,anchor"], "ablatoin: unknown key; did you mean 'ablation'?"),
+        (["--multirun", "scene=courtyard,cortyard"], "scene: there is no scene 'cortyard'; did you mean 'courtyard'?"),
+        (["scene=default"], "scene: there is no scene 'default'"),
+        (["--multirun", "scene=glob(zz*)"], "scene=glob(zz*): stands for no scene; known: courtyard"),
+        (["--multirun", "scene="], "scene: there is no scene ''"),
+        (["--multirun", "scene=courtyard", "scene=courtyard"], "scene: is given twice"),
+        (["--multirun", "scene=range(1"], "scene: there is no scene 'range(1'"),
+        (["seed=0,1"], "seed=0,1: holds several values; add --multirun"),
         (["seed=${oc.env:HOME}"], "environment variable"),
         (["hydra.run.dir=${oc.env:HOME}"], "environment variable"),
     ],
@@ -52,13 +65,95 @@ def test_good_axes_pass_as_they_are() -> None:
     given = ["--multirun", "ablation=glob(realign*)", "seed=0,1", "adapt.steps=range(2,8,2)", "hydra/launcher=parallel"]
     if not (ROOT / "conf" / "hydra" / "launcher" / "parallel.yaml").is_file():
         given.pop()
-    assert check_axes(given, ROOT) == given
+    axes = check_axes(given, ROOT)
+    assert axes.arguments == given
+    # The first of every axis together, then every other value once.
+    assert {item for job in axes.jobs for item in job.overrides if item.startswith("seed")} == {"seed=0", "seed=1"}
+    assert {job.scene for job in axes.jobs} == {None}
+
+
+def scenes_of(project: Path, *names: str) -> None:
+    for name in names:
+        (project / "scenes" / name).mkdir(parents=True)
+        (project / "scenes" / name / "scene.yaml").write_text("rounds: []")
+    (project / "params.yaml").write_text(
+        f"scenes: [{names[0]}]\nrounds: [{{k: 1, prev: 0}}]\nmethods: [captured, omnivggt]\noverrides: [seed=7]\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("axis", "expected"),
+    [
+        ("scene=a,c", ["a", "c"]),
+        ("scene=glob(*)", ["a", "b", "c"]),
+        ("scene=glob(*,exclude=b)", ["a", "c"]),
+        ("scene=c", ["c"]),
+        ("scene=choice(b,a)", ["b", "a"]),
+    ],
+)
+def test_scenes_are_an_axis(axis: str, expected: list[str], project: Path) -> None:
+    scenes_of(project, "a", "b", "c")
+    axes = check_axes(["--multirun", axis, "ablation=full,anchor"], project)
+    assert list(dict.fromkeys(job.scene for job in axes.jobs)) == expected
+    assert f"+swept_scene={','.join(expected)}" in axes.arguments
+    assert axis not in axes.arguments
+
+
+def test_every_scene_of_a_sweep_is_a_job_with_its_own_selection(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Hydra's own command line, over everything but the pipeline: scenes, settings and methods arrive as they were asked for."""
+    scenes_of(project, "a", "b")
+    made: list[Selection] = []
+    checked: list[dict[str, object]] = []
+
+    def workspace(folder: Path, selection: Selection, **_: object) -> Path:
+        made.append(selection)
+        folder.mkdir(parents=True)
+        return folder
+
+    monkeypatch.setattr(sweep, "make_workspace", workspace)
+    monkeypatch.setattr(sweep, "reproduce_shared", lambda *_, **__: None)
+    monkeypatch.setattr(sweep, "check_scene", lambda scene, *_, **given: checked.append({"scene": scene, **given}))
+    monkeypatch.setattr(sys, "argv", ["sweep"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    given = [
+        "--multirun",
+        "scene=a,b",
+        "adapt.steps=1,2",
+        "hydra/launcher=serial",
+        f"hydra.sweep.dir={tmp_path / 'out'}",
+    ]
+    axes = check_axes(given, project)
+    sweep.check_inputs(axes.jobs, project)
+    assert [one["scene"] for one in checked] == ["a", "b"], (
+        "settings that pictures and weights know nothing of are not read twice"
+    )
+    run_hydra(axes.arguments, project)
+    assert [(one.scenes, one.overrides) for one in made] == [
+        ((scene,), ("seed=7", f"adapt.steps={steps}")) for scene in "ab" for steps in (1, 2)
+    ]
+    assert {one.methods for one in made} == {("captured", "omnivggt")}
+    assert {one["methods"] for one in checked} == {("captured", "omnivggt")}
+    assert "scene=b adapt.steps=2: " in capsys.readouterr().out
+
+
+def test_weights_of_rivals_are_checked_before_any_job_runs(project: Path, tmp_path: Path) -> None:
+    scenes_of(project, "courtyard")
+    shutil.rmtree(project / "scenes" / "courtyard")
+    (project / "scenes" / "courtyard").symlink_to(ROOT / "scenes" / "courtyard")
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(b"x")
+    given = ["--multirun", f"rivals.omnivggt.weights={bad}", "profile=smoke", "adapt.steps=1,2"]
+    axes = check_axes(given, project)
+    with pytest.raises(UserError, match=r"bad\.safetensors"):
+        sweep.check_inputs(axes.jobs, project)
 
 
 def test_a_file_with_any_name_is_one_value(tmp_path: Path) -> None:
     path = tmp_path / "a, b.png"
     path.write_text("x")
-    items = check_axes(["generator=file", f"generator.file={path}"], ROOT)
+    items = check_axes(["generator=file", f"generator.file={path}"], ROOT).arguments
     assert items[1] == f"generator.file='{path}'"
 
 

@@ -51,9 +51,11 @@ def test_refreshing_keeps_outputs_and_takes_edits(tmp_path: Path) -> None:
 def test_later_overrides_stand_and_files_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "w.safetensors").write_text("x")
-    merged = merged_overrides(("seed=0", "ablation=full"), ("ablation=anchor", "model.weights=w.safetensors"))
+    merged = merged_overrides(
+        ("seed=0", "ablation=full"), ("ablation=anchor", "model.weights=w.safetensors"), project=tmp_path
+    )
     assert merged == ("seed=0", "ablation=anchor", f"model.weights={tmp_path / 'w.safetensors'}")
-    assert merged_overrides((), ("model.weights=org/name@main",)) == ("model.weights=org/name@main",)
+    assert merged_overrides((), ("model.weights=org/name@main",), project=tmp_path) == ("model.weights=org/name@main",)
 
 
 def test_a_malformed_selection_is_one_line(tmp_path: Path) -> None:

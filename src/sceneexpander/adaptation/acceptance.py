@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.adaptation.config import Realign
 from sceneexpander.adaptation.consistency import agreement
-from sceneexpander.adaptation.realign import realign
+from sceneexpander.adaptation.realign import anchored_depth, realign
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.gauge import posed_in_both, poses_relative_to
@@ -78,7 +78,7 @@ def judge_candidate(
     photos = torch.arange(count, device=poses.device)
     if captured.posed is not None and bool(captured.posed.any()):
         photos = photos[captured.posed]
-    found = agreement(points, anchors.depth[photos], poses[photos], intrinsics[photos])
+    found = agreement(points, anchored_depth(captured, anchors)[photos], poses[photos], intrinsics[photos])
     overlap = float(found.seen.float().mean())
     depth_conflict = float(found.conflict[found.seen].abs().median()) if posed and bool(found.seen.any()) else None
     one = torch.cat([photos, photos.new_tensor([len(poses) - 1])])
@@ -106,24 +106,22 @@ def judge_candidate(
 
 
 @torch.no_grad()
-def captured_moved(captured: Priors, joint: Priors) -> float | None:
-    """How far the insertion moved the captured views' geometry: mean |log ratio| of their depths, in one scale.
+def captured_moved(
+    anchors: Anchors,
+    depth: Float[Tensor, "captured height width"],
+    posed: Bool[Tensor, "captured"] | None = None,
+) -> float:
+    """How far the insertion moves what the model says of the captured views: mean |log ratio| of depth to anchored depth.
 
-    This is what Algorithm 1 can repair: its anchors are the geometry before the insertion. None where the front-end has not run.
+    This is what Algorithm 1 can repair, since its anchors are the depth before the insertion.
 
     Args:
-        captured: of the captured views before the insertion.
-        joint: of the same views and the inserted one, as the round goes on with them, in the same gauge.
+        anchors: of the captured views.
+        depth: what the unadapted model predicts for them beside the inserted view, in the same gauge.
+        posed: views whose camera is an estimate; the others take no part, unless there is nothing else.
     """
-    if captured.depth is None or joint.depth is None:
-        return None
-    count = len(captured.depth)
-    both = posed_in_both(captured, joint, count)
-    if not bool(both.any()):
-        both = torch.ones_like(both)
-    before, after = captured.depth[both], joint.depth[:count][both]
-    known = (before > 0) & (after > 0)
-    return float((after[known] / before[known]).log().abs().mean()) if bool(known.any()) else None
+    change = (depth / anchors.depth).log().abs().mean((-2, -1))
+    return float((change[posed] if posed is not None and bool(posed.any()) else change).mean())
 
 
 def _turned_deg(before: Tensor, after: Tensor) -> float:

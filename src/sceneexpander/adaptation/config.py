@@ -62,8 +62,8 @@ class Realign(StrEnum):
 class Spend(StrEnum):
     """When the steps of Algorithm 1 are run: always (the paper), or only where they have something to repair.
 
-    ``where_moved``: where the estimate that the round goes on with has other geometry for the captured views than the one before the
-    insertion, see `sceneexpander.adaptation.acceptance.captured_moved`.
+    ``where_moved``: where the unadapted model gives the captured views another depth beside the inserted view than without it, see
+    `sceneexpander.adaptation.acceptance.captured_moved`.
     """
 
     ALWAYS = "always"
@@ -173,10 +173,12 @@ class AdaptConfig:
     splat_steps: Steps = 0  # steps of the Gaussian head alone on the captured photos, after Algorithm 1; 0: none
     splat_learning_rate: LearningRate = 3e-3
     splat_others: Weight = 0.5  # weight of the same photos without the view's own Gaussians
+    # weight of opacities and sizes of Gaussians among the anchors, which the paper's losses never see; 0: they are not made
+    alpha_gaussian: Weight = 0.0
     inserted_weights: InsertedWeights = InsertedWeights.UNIFORM
     spend: Spend = Spend.ALWAYS
     # with spend=where_moved: least mean change of the captured views' log depth by the insertion that is worth the steps
-    spend_above: Annotated[float, Range(0, 10)] = 0.02
+    spend_above: Annotated[float, Range(0, 10)] = 0.002
     realign: Realign = Realign.NONE
     # bring the inserted picture to the photos' exposure and white balance, see `sceneexpander.adaptation.tone`
     tone: bool = False

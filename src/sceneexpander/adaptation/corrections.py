@@ -23,7 +23,6 @@ class Corrections:
     held_error: the same of the held one.
     refinement: of the inserted camera; None: it was not refined.
     gains: on the inserted picture's colours (RGB); None: it is as it was given.
-    captured_moved: see `acceptance.captured_moved`, of the estimate that was taken.
     """
 
     estimate: Estimate = Estimate.JOINT
@@ -31,4 +30,3 @@ class Corrections:
     held_error: float | None = None
     refinement: RealignReport | None = None
     gains: tuple[float, float, float] | None = None
-    captured_moved: float | None = None

@@ -18,7 +18,9 @@ from sceneexpander.adaptation.objective import Grid
 from sceneexpander.adaptation.sampling import Batch
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.store import sha256_of_tensors, to_plain
+from sceneexpander.errors import UserError
 from sceneexpander.geometry.gauge import priors_relative_to
+from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.lookup import warp_maps
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
@@ -119,7 +121,26 @@ def geometry_of(prediction: Prediction) -> ViewGeometry:
     """The part of a prediction that the losses read."""
     if prediction.depth is None or prediction.normals is None:
         raise ValueError("the adaptation needs the depth and normal heads")
-    return ViewGeometry(camera_vector=prediction.camera_vector, depth=prediction.depth, normals=prediction.normals)
+    return ViewGeometry(
+        camera_vector=prediction.camera_vector,
+        depth=prediction.depth,
+        normals=prediction.normals,
+        splats=None if prediction.gaussians is None else _splats_of(prediction.gaussians, prediction.depth),
+    )
+
+
+def _splats_of(gaussians: Gaussians, depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view height width 4"]:
+    """Opacities and log scales by pixel. Raises `UserError` for models that make another number of Gaussians."""
+    if len(gaussians) != depth.numel():
+        raise UserError(
+            "needs a model with one Gaussian per pixel", where="adapt.alpha_gaussian", fix="use 0 with this one"
+        )
+    return torch.cat([gaussians.opacities[:, None], gaussians.scales.log()], dim=1).view(*depth.shape, 4)
+
+
+def heads_of(config: AdaptConfig) -> frozenset[Head]:
+    """What the losses read."""
+    return GEOMETRY_HEADS | {Head.GAUSSIANS} if config.alpha_gaussian > 0 else GEOMETRY_HEADS
 
 
 def run_key(model: Reconstructor, inputs: AdaptationInputs, config: AdaptConfig, seed: int) -> str:

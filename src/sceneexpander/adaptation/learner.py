@@ -8,7 +8,7 @@ from torch import Tensor
 from sceneexpander.adaptation.config import AdaptConfig, InsertedWeights
 from sceneexpander.adaptation.consistency import inserted_weights
 from sceneexpander.adaptation.engine import autocast, set_up
-from sceneexpander.adaptation.inputs import StepViews, geometry_of
+from sceneexpander.adaptation.inputs import StepViews, geometry_of, heads_of
 from sceneexpander.adaptation.ledger import WeightLedger, teacher_of
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import StepLosses, anchor_targets, step_losses
@@ -42,7 +42,7 @@ class Learner:
         # First the teacher: its activations are gone when the student's, which are kept, are made.
         teacher, weights = self._teach(views, batch.captured) if batch.inserted else (None, None)
         with autocast(self.config, self.device):
-            student = geometry_of(views.predict(self.model))
+            student = geometry_of(views.predict(self.model, heads_of(self.config)))
         targets = anchor_targets(self.anchors, batch, views.grids, student, self.config)
         return step_losses(student, targets, teacher, self.config, weights)
 

@@ -9,18 +9,19 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from sceneexpander.adaptation import plateau
 from sceneexpander.adaptation.checkpoint import Checkpoint
 from sceneexpander.adaptation.config import AdaptConfig, DriftForm
 from sceneexpander.adaptation.corrections import Corrections
-from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, run_key
+from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, geometry_of, heads_of, run_key
 from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import NonFiniteLoss
 from sceneexpander.adaptation.observe import Look, Observer, warnings_of
-from sceneexpander.adaptation.sampling import sample_batch
+from sceneexpander.adaptation.sampling import Batch, sample_batch
 from sceneexpander.adaptation.trainable import plain_state, trained_parts
 from sceneexpander.geometry.gauge import in_gauge_of
 from sceneexpander.models.protocol import Reconstructor, as_module
@@ -47,6 +48,7 @@ class StepRecord:
     drift: float  # L_reg before lambda_reg
     gradient_norm: float
     restored: int
+    anchor_gaussian: float = 0.0  # beyond the paper, see `AdaptConfig.alpha_gaussian`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,11 +147,20 @@ class Run:
         if inputs.captured_priors is not None and inputs.joint_priors is not None:
             inputs = replace(inputs, joint_priors=in_gauge_of(inputs.captured_priors, inputs.joint_priors))
         self.inputs, self.config, self.seed = inputs, config, seed
+        self.source = ViewSource(model, inputs, config, seed=seed)
         anchors = ViewGeometry(
-            camera_vector=inputs.anchors.camera_vector, depth=inputs.anchors.depth, normals=inputs.anchors.normals
+            camera_vector=inputs.anchors.camera_vector,
+            depth=inputs.anchors.depth,
+            normals=inputs.anchors.normals,
+            splats=self._frozen_splats(model) if config.alpha_gaussian > 0 else None,
         )
         self.learner = Learner(model, anchors, config, seed=seed)
-        self.source = ViewSource(model, self.inputs, config, seed=seed)
+
+    @torch.no_grad()
+    def _frozen_splats(self, model: Reconstructor) -> Tensor | None:
+        """The captured views' Gaussians as the model makes them before its first step, from those views alone."""
+        everything = Batch(captured=tuple(range(len(self.inputs.captured))), inserted=False)
+        return geometry_of(self.source.plain_views(everything).predict(model, heads_of(self.config))).splats
 
     def go(self, log: RunLog, observer: Observer, key: str, checkpoint_folder: Path | None) -> None:
         """All steps that are left, with their looks and resume points."""
@@ -180,7 +191,7 @@ class Run:
         del losses  # and the activations with them
         done = ledger.update(step)
         if not math.isfinite(done.gradient):
-            raise NonFiniteLoss(f"the gradient is not finite at step {step}")
+            raise NonFiniteLoss("the gradient is not finite", step)
         drift = done.drift if config.drift is DriftForm.SUM else done.drift / ledger.adapted
         return StepRecord(
             step=step,

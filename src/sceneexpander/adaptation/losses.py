@@ -6,6 +6,7 @@ All distances return one value per view.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -17,30 +18,34 @@ from sceneexpander.adaptation.config import AdaptConfig, DepthDistance
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewGeometry:
-    """(P, D, N) of some views: camera 9-vectors, depth, normals."""
+    """(P, D, N) of some views: camera 9-vectors, depth, normals; beyond the paper their pixels' Gaussians.
+
+    ``splats``: opacity and the logarithms of the three scales; None: not asked for.
+    """
 
     camera_vector: Float[Tensor, "view 9"]
     depth: Float[Tensor, "view height width"]
     normals: Float[Tensor, "view height width 3"]
+    splats: Float[Tensor, "view height width 4"] | None = None
 
     def view(self, start: int, stop: int | None = None) -> ViewGeometry:
         """A slice of the views."""
-        return ViewGeometry(
-            camera_vector=self.camera_vector[start:stop],
-            depth=self.depth[start:stop],
-            normals=self.normals[start:stop],
-        )
+        return self._changed(lambda values: values[start:stop])
 
     def clone(self) -> ViewGeometry:
         """The same values in memory of their own."""
-        return ViewGeometry(
-            camera_vector=self.camera_vector.clone(), depth=self.depth.clone(), normals=self.normals.clone()
-        )
+        return self._changed(Tensor.clone)
 
     def detach(self) -> ViewGeometry:
         """The same values as targets, outside the autograd graph."""
+        return self._changed(Tensor.detach)
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> ViewGeometry:
         return ViewGeometry(
-            camera_vector=self.camera_vector.detach(), depth=self.depth.detach(), normals=self.normals.detach()
+            camera_vector=change(self.camera_vector),
+            depth=change(self.depth),
+            normals=change(self.normals),
+            splats=None if self.splats is None else change(self.splats),
         )
 
 
@@ -93,6 +98,14 @@ def normal_distance(
 ) -> Float[Tensor, "view"]:
     """d_N: mean of 1 - cosine. Inputs are unit vectors."""
     return _mean(1 - (predicted * target).sum(-1), weights)
+
+
+def splat_distance(
+    predicted: Float[Tensor, "view height width 4"], target: Float[Tensor, "view height width 4"]
+) -> Float[Tensor, "view"]:
+    """Mean absolute difference of opacities plus that of the scales' logarithms (beyond the paper)."""
+    difference = (predicted - target).abs().mean((1, 2))
+    return difference[:, 0] + difference[:, 1:].mean(1)
 
 
 def _mean(

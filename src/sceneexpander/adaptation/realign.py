@@ -78,6 +78,15 @@ def realign(
     return _refined(held, anchors, images, inserted, generator)
 
 
+def anchored_depth(captured: Priors, anchors: Anchors) -> Float[Tensor, "captured height width"]:
+    """The anchors' depth in the scale of the captured views' priors: a model may have chosen another."""
+    if captured.depth is None:
+        return anchors.depth
+    depth = captured.depth[: len(anchors.depth)]
+    known = depth > 0
+    return anchors.depth * float((depth[known] / anchors.depth[known]).median()) if bool(known.any()) else anchors.depth
+
+
 def _parts(priors: Priors) -> tuple[Tensor, Tensor, Tensor]:
     if priors.world_from_cam is None or priors.intrinsics_px is None or priors.depth is None:
         raise ValueError("realignment needs priors with poses, intrinsics and depth")
@@ -122,7 +131,8 @@ def _refined(
     seen = torch.arange(count, device=poses.device)
     if held.posed is not None and bool(held.posed[:count].any()):
         seen = seen[held.posed[:count]]  # where the points of a placeholder are means nothing
-    points = unproject_to_world(anchors.depth[seen], intrinsics[seen], poses[seen]).reshape(-1, 3)
+    own = anchored_depth(held, anchors)
+    points = unproject_to_world(own[seen], intrinsics[seen], poses[seen]).reshape(-1, 3)
     colours = images[seen].movedim(1, -1).reshape(-1, 3)
     chosen = torch.randperm(len(points), generator=generator)[: 4 * _POINTS].to(points.device)
     points, colours = points[chosen], colours[chosen]
@@ -140,7 +150,7 @@ def _refined(
     pose = rigid_inverse(cam_from_world)
     accepted = bool(torch.isfinite(pose).all()) and after < before
     factor = _depth_factor(points, cam_from_world, intrinsics[-1], depth[-1]) if accepted else 1.0
-    median = float(anchors.depth.median())
+    median = float(own.median())
     report = RealignReport(
         turned_deg=float(rotation_angle_deg(pose[:3, :3], poses[-1, :3, :3])) if accepted else 0.0,
         shifted=float((pose[:3, 3] - poses[-1, :3, 3]).norm()) / median if accepted else 0.0,

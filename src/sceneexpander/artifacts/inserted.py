@@ -21,9 +21,7 @@ class Provenance:
     sha256: str  # of the picture's original bytes
     reference_sha256: tuple[str, ...] = ()  # of the captured pictures that were shown to the generator
     parameters: dict[str, str] = field(default_factory=dict)
-    request_id: str | None = None
-    cost_usd: float | None = None
-    refusal: str | None = None
+    refusal: str | None = None  # why it cannot be used
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,6 +19,7 @@ from sceneexpander.artifacts.store import (
 from sceneexpander.artifacts.views import ViewSet
 
 SCHEMA = "scene/1"
+KNOWN_SCHEMA = "known-cameras/1"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +43,24 @@ class KnownCameras:
     world_from_cam: Float[Tensor, "view 4 4"] | None = None
     intrinsics_px: Float[Tensor, "view 3 3"] | None = None
     metric: bool = False  # True only if translations are known to be metres
+
+    def save(self, folder: Path) -> None:
+        """Write into a (scratch) folder."""
+        tensors = {name: getattr(self, name) for name in ("world_from_cam", "intrinsics_px")}
+        given = {name: value for name, value in tensors.items() if value is not None}
+        save_artifact(folder, KNOWN_SCHEMA, {"metric": self.metric}, given)
+
+    @classmethod
+    def load(cls, folder: Path) -> KnownCameras:
+        """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
+        facts, tensors = load_artifact(folder, KNOWN_SCHEMA)
+        read = read_typed(_KnownFacts, facts, folder / FACTS_NAME)
+        return cls(**load_fields(cls, {"metric": read.metric}, tensors, folder))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _KnownFacts:
+    metric: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.store import (
     FACTS_NAME,
     RERUN,
@@ -110,6 +111,7 @@ class ExpansionState:
         weights: adapted in the rounds so far.
         first_weights: those of round 0, which no insertion has touched; None: ``weights`` are those.
         toned: inserted views whose picture was brought to the photos' tone; None: there are none.
+        known: cameras of the first views, the captured ones, that were given and not estimated.
     """
 
     views: ViewSet
@@ -117,6 +119,7 @@ class ExpansionState:
     weights: WeightsChange
     first_weights: WeightsChange | None = None
     toned: ViewSet | None = None
+    known: KnownCameras | None = None
 
     @property
     def unadapted(self) -> WeightsChange:
@@ -137,6 +140,8 @@ class ExpansionState:
             self.first_weights.save(folder / "first_weights")
         if self.toned is not None:
             self.toned.save(folder / "toned")
+        if self.known is not None:
+            self.known.save(folder / "known")
 
     @classmethod
     def load(cls, folder: Path) -> ExpansionState:
@@ -147,6 +152,7 @@ class ExpansionState:
             weights=WeightsChange.load(folder / "weights"),
             first_weights=_if_there(folder / "first_weights", WeightsChange.load),
             toned=_if_there(folder / "toned", ViewSet.load),
+            known=_if_there(folder / "known", KnownCameras.load),
         )
 
 

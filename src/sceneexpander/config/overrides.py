@@ -62,21 +62,25 @@ def _text_keys(schema: type, prefix: str) -> Iterator[str]:
             yield f"{prefix}{name}"
 
 
-def written_out(items: Sequence[str], *, absolute: bool = False, sweep: bool = False) -> tuple[str, ...]:
+def written_out(
+    items: Sequence[str], *, absolute: bool = False, sweep: bool = False, folder: Path | None = None
+) -> tuple[str, ...]:
     """Overrides as people write them, as Hydra reads them: texts that its grammar would take apart are quoted.
 
     Args:
         items: overrides such as ``generator.file=/home/Müller, A/it's #1.png``.
         absolute: make paths of files that exist absolute, for a run in another folder.
         sweep: ``a,b`` stands for two values, unless it is the name of a file.
+        folder: what relative paths start at; None: the current folder.
 
     Raises:
         ConfigError: a value is not valid text, or names the home folder of nobody.
     """
-    return tuple(_written_out(item, absolute=absolute, sweep=sweep) for item in items)
+    start = Path.cwd() if folder is None else folder.absolute()
+    return tuple(_written_out(item, absolute=absolute, sweep=sweep, folder=start) for item in items)
 
 
-def _written_out(item: str, *, absolute: bool, sweep: bool) -> str:
+def _written_out(item: str, *, absolute: bool, sweep: bool, folder: Path) -> str:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.core.override_parser.types import ValueType
     from hydra.errors import HydraException
@@ -89,8 +93,8 @@ def _written_out(item: str, *, absolute: bool, sweep: bool) -> str:
         return item
     if len(item) > MAX_OVERRIDE:
         return item  # is refused when it is composed
-    if name in PATH_KEYS and _names_a_file(raw, where=name):
-        return f"{key}={quoted(_absolute(raw, name) if absolute else raw)}"
+    if name in PATH_KEYS and _names_a_file(raw, folder, where=name):
+        return f"{key}={quoted(_absolute(raw, folder, name) if absolute else raw)}"
     try:
         parsed = OverridesParser.create().parse_override(item)
         value = parsed.value()
@@ -101,9 +105,9 @@ def _written_out(item: str, *, absolute: bool, sweep: bool) -> str:
         return item if sweep else f"{key}={quoted(raw)}"
     # Written as Hydra wants it, e.g. in quotes.
     text = _plain(value) if isinstance(value, str) and name in PATH_KEYS and absolute else None
-    if text is None or not _names_a_file(text, where=name):
+    if text is None or not _names_a_file(text, folder, where=name):
         return item
-    return f"{key}={quoted(_absolute(text, name))}"
+    return f"{key}={quoted(_absolute(text, folder, name))}"
 
 
 def _plain(value: str) -> str | None:
@@ -114,14 +118,15 @@ def _plain(value: str) -> str | None:
     return re.sub(r"(\\*)\\\$\{", lambda match: match[1][: len(match[1]) // 2] + "${", value)
 
 
-def _absolute(text: str, name: str) -> str:
-    return str(expanded(text, where=name).absolute())
+def _absolute(text: str, folder: Path, name: str) -> str:
+    return str(folder / expanded(text, where=name))
 
 
-def _names_a_file(text: str, *, where: str) -> bool:
+def _names_a_file(text: str, folder: Path, *, where: str) -> bool:
     try:
         return any(
-            expanded(name, where=where).is_file() for name in dict.fromkeys((text, text.replace(ROUND_FIELD, "1")))
+            (folder / expanded(name, where=where)).is_file()
+            for name in dict.fromkeys((text, text.replace(ROUND_FIELD, "1")))
         )
     except (OSError, ValueError):  # too long, or characters that no file has
         return False

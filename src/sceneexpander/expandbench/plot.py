@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sceneexpander.expandbench.grades import GRADES
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
-from sceneexpander.expandbench.table import COLUMNS, Column, mean_of, row_names
+from sceneexpander.expandbench.table import COLUMNS, Column, paired, row_names
 
 UNITS = {
     "rotation": "degrees, camera estimated",
@@ -23,16 +23,13 @@ UNITS = {
 
 def curve(cells: Sequence[CellResult], row: str, axis: str, column: Column) -> list[tuple[float, float]]:
     """(amount, mean difference to the pre-insertion scene) along an axis, the clean insertion at amount 0 if it was measured."""
-    ceiling = {cell.scene: column.of(cell.numbers) for cell in cells if cell.row == CAPTURED}
     start = "told_clean" if axis.startswith("told_") else "clean"
     points = []
     for grade in [GRADES[start], *(grade for grade in GRADES.values() if grade.axis == axis)]:
-        own = [cell for cell in cells if cell.row == row and cell.grade == grade.name]
-        value = mean_of(own, column)
-        references = [ceiling.get(cell.scene) for cell in own]
-        known = [reference for reference in references if reference is not None]
-        if value is not None and len(known) == len(references):
-            points.append((0.0 if grade.name == start else grade.amount, value - sum(known) / len(known)))
+        here = [cell for cell in cells if cell.row == CAPTURED or (cell.row == row and cell.grade == grade.name)]
+        found = paired(here, row, column, against=CAPTURED)
+        if found is not None:
+            points.append((0.0 if grade.name == start else grade.amount, found.mean))
     return points
 
 

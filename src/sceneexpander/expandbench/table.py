@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.expandbench.measure import BenchNumbers
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
 
@@ -47,7 +48,7 @@ COLUMNS: tuple[Column, ...] = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Paired:
-    """Differences of a row to the baseline in the same scene and grade, one per scene (mean over grades and seeds)."""
+    """Differences of a row to another in the same scene, grade and seed, one per scene (mean over grades and seeds)."""
 
     row: str
     mean: float
@@ -82,14 +83,14 @@ def seed_spread(cells: Sequence[CellResult], column: Column) -> float | None:
     return statistics.stdev(known) if len(known) > 1 and len(known) == len(means) else None
 
 
-def paired(cells: Sequence[CellResult], row: str, column: Column) -> Paired | None:
-    """A row against the baseline; None if they share no scene and grade with a value."""
-    base = {(c.scene, c.grade): column.of(c.numbers) for c in cells if c.row == BASELINE}
+def paired(cells: Sequence[CellResult], row: str, column: Column, *, against: str = BASELINE) -> Paired | None:
+    """A row against another; None if they share no scene, grade and seed with a value. `CAPTURED` is the same for every grade."""
+    base = {_pair(c, against): column.of(c.numbers) for c in cells if c.row == against}
     own = [c for c in cells if c.row == row]
     differences: dict[str, list[float]] = {}
     by_seed: dict[int, list[float]] = {}
     for cell in own:
-        value, reference = column.of(cell.numbers), base.get((cell.scene, cell.grade))
+        value, reference = column.of(cell.numbers), base.get(_pair(cell, against))
         if value is None or reference is None:
             continue
         differences.setdefault(cell.scene, []).append(value - reference)
@@ -108,6 +109,10 @@ def paired(cells: Sequence[CellResult], row: str, column: Column) -> Paired | No
     )
 
 
+def _pair(cell: CellResult, against: str) -> tuple[str, str, int]:
+    return cell.scene, "" if against == CAPTURED else cell.grade, cell.seed
+
+
 def main_table(cells: Sequence[CellResult], columns: Sequence[Column] = COLUMNS) -> str:
     """One line per row: means over scenes and grades, ± over seeds."""
     lines = []
@@ -124,21 +129,63 @@ def main_table(cells: Sequence[CellResult], columns: Sequence[Column] = COLUMNS)
 
 
 def paired_table(cells: Sequence[CellResult], columns: Sequence[Column] = COLUMNS) -> str:
-    """One line per row: mean difference to the baseline, the worst scene's, and how many scenes are better."""
-    lines = []
-    for row in row_names(cells):
-        if row in (CAPTURED, BASELINE):
-            continue
-        texts = []
-        for column in columns:
-            found = paired(cells, row, column)
-            texts.append(
-                "–"
-                if found is None
-                else f"{found.mean:+.{column.digits}f} (worst {found.lowest:+.{column.digits}f}; {found.better}/{found.scenes})"
-            )
-        lines.append([row, *texts])
+    """One line per row: mean difference to the baseline, its spread over seeds, the worst scene's, and how many scenes are better."""
+    lines = [
+        [row, *(_difference(paired(cells, row, column), column) for column in columns)]
+        for row in row_names(cells)
+        if row not in (CAPTURED, BASELINE)
+    ]
     return _markdown(["row", *(column.title for column in columns)], lines)
+
+
+def components_table(
+    cells: Sequence[CellResult], references: Mapping[str, str], powerless: Mapping[str, str], columns: Sequence[Column]
+) -> str:
+    """One line per row against the row that lacks one component (or has one more), so that the component's own effect shows.
+
+    Args:
+        cells: of all rows.
+        references: the other row, by row.
+        powerless: rows that cannot differ from theirs in so few steps, and why: this stands in the numbers' place.
+        columns: what is compared.
+    """
+    lines = []
+    for row, reference in references.items():
+        found = [paired(cells, row, column, against=reference) for column in columns]
+        if all(item is None for item in found):
+            continue
+        texts = [_difference(item, column) for item, column in zip(found, columns, strict=True)]
+        if row in powerless:
+            texts = [powerless[row], *["–"] * (len(columns) - 1)]
+        lines.append([row, reference, *texts])
+    return _markdown(["row", "against", *(column.title for column in columns)], lines)
+
+
+def scenes_table(cells: Sequence[CellResult], rows: Sequence[str], column: Column = COLUMNS[0]) -> str:
+    """Scene by scene: the value before the insertion, what the insertion costs, and each row's difference to the baseline."""
+    scenes = list(dict.fromkeys(cell.scene for cell in cells))
+    shown = [("before", None, None), ("baseline", BASELINE, CAPTURED), *((row, row, BASELINE) for row in rows)]
+    lines = []
+    for title, row, against in shown:
+        texts = []
+        for scene in scenes:
+            here = [cell for cell in cells if cell.scene == scene]
+            if row is None or against is None:
+                value = mean_of([cell for cell in here if cell.row == CAPTURED], column)
+                texts.append("–" if value is None else f"{value:.{column.digits}f}")
+            else:
+                found = paired(here, row, column, against=against)
+                texts.append("–" if found is None else f"{found.mean:+.{column.digits}f}")
+        lines.append([title, *texts])
+    return _markdown([column.title, *scenes], lines)
+
+
+def _difference(found: Paired | None, column: Column) -> str:
+    if found is None:
+        return "–"
+    spread = "" if found.seed_spread is None else f" ± {found.seed_spread:.{column.digits}f}"
+    worst = f"worst {found.lowest:+.{column.digits}f}; {found.better}/{found.scenes}"
+    return f"{found.mean:+.{column.digits}f}{spread} ({worst})"
 
 
 def alone_table(cells: Sequence[CellResult]) -> str:
@@ -161,20 +208,13 @@ def alone_table(cells: Sequence[CellResult]) -> str:
 
 
 def curve_table(cells: Sequence[CellResult], rows: Sequence[str], column: Column = COLUMNS[0]) -> str:
-    """Per grade: the ceiling, the baseline's loss against it, and each row's gain over the baseline."""
+    """Per grade: what the insertion costs against the scene before it, and each row's gain over the baseline."""
     lines = []
-    ceiling = mean_of([cell for cell in cells if cell.row == CAPTURED], column)
+    before = [cell for cell in cells if cell.row == CAPTURED]
     for grade in dict.fromkeys(cell.grade for cell in cells if cell.grade):
         here = [cell for cell in cells if cell.grade == grade]
-        base = mean_of([cell for cell in here if cell.row == BASELINE], column)
-        texts = [
-            "–" if base is None or ceiling is None else f"{base - ceiling:+.{column.digits}f}",
-        ]
-        for row in rows:
-            found = paired(here, row, column)
-            texts.append(
-                "–" if found is None else f"{found.mean:+.{column.digits}f} (worst {found.lowest:+.{column.digits}f})"
-            )
+        texts = [_difference(paired([*before, *here], BASELINE, column, against=CAPTURED), column)]
+        texts += [_difference(paired(here, row, column), column) for row in rows]
         lines.append([grade, *texts])
     return _markdown(["grade", f"insertion's effect on {column.title}", *(f"{row} − baseline" for row in rows)], lines)
 
@@ -187,12 +227,15 @@ def acceptance_table(cells: Sequence[CellResult]) -> str:
 
     "Tells apart" is the probability that a harmful candidate has the larger value (the smaller for the overlap): 0.5 is chance.
     """
-    ceiling = {cell.scene: cell.numbers.psnr_db for cell in cells if cell.row == CAPTURED}
-    judged = [
-        (cell.candidate, ceiling[cell.scene] - cell.numbers.psnr_db)
-        for cell in cells
-        if cell.row == BASELINE and cell.candidate is not None and cell.scene in ceiling
-    ]
+    before = {(cell.scene, cell.seed): cell.numbers.psnr_db for cell in cells if cell.row == CAPTURED}
+    candidates: dict[tuple[str, str], Acceptance] = {}
+    costs: dict[tuple[str, str], list[float]] = {}
+    for cell in cells:
+        if cell.row == BASELINE and cell.candidate is not None and (cell.scene, cell.seed) in before:
+            # A candidate is judged once, whatever the seed.
+            candidates[cell.scene, cell.grade] = cell.candidate
+            costs.setdefault((cell.scene, cell.grade), []).append(before[cell.scene, cell.seed] - cell.numbers.psnr_db)
+    judged = [(candidate, statistics.fmean(costs[key])) for key, candidate in candidates.items()]
     if not judged:
         return "No candidate was judged.\n"
     harmful = [harm > HARM_DB for _, harm in judged]

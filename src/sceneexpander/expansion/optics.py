@@ -1,7 +1,12 @@
-"""What the files of views say of their lenses, as the front-end takes it."""
+"""What is known of cameras before the pictures are asked, as the front-end takes it: what files say of lenses, and given cameras."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import torch
+
+from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.frontend.lenses import ViewOptics
 
@@ -9,6 +14,31 @@ from sceneexpander.frontend.lenses import ViewOptics
 def optics_of(views: ViewSet) -> tuple[ViewOptics, ...]:
     """Per view how its stored picture lies on the original, and what its file says of the lens."""
     return tuple(_optics(record) for record in views.records)
+
+
+def known_of(views: ViewSet, known: KnownCameras | None) -> KnownCameras | None:
+    """The known cameras with a row for every view: those that came later, after the views that the cameras belong to, have none.
+
+    Their poses are not finite, which the front-end takes for unknown. Known intrinsics are kept as they are, so the front-end wants them
+    of all views: a picture that was drawn with the photos gets their focal lengths (in stored pixels) and its own centre.
+    """
+    if known is None:
+        return None
+    poses, intrinsics = known.world_from_cam, known.intrinsics_px
+    if poses is not None:
+        missing = poses.new_full((len(views) - len(poses), 4, 4), float("nan"))
+        poses = torch.cat([poses, missing])
+    if intrinsics is not None:
+        focals = intrinsics[:, [0, 1], [0, 1]].median(dim=0).values
+        rows = [intrinsics]
+        for record in views.records[len(intrinsics) :]:
+            affine = intrinsics.new_tensor(record.stored_from_original)
+            middle = intrinsics.new_tensor([record.original_width / 2, record.original_height / 2])
+            row = torch.eye(3).to(intrinsics)
+            row[[0, 1], [0, 1]], row[:2, 2] = focals, affine[:, :2] @ middle + affine[:, 2]
+            rows.append(row[None])
+        intrinsics = torch.cat(rows)
+    return replace(known, world_from_cam=poses, intrinsics_px=intrinsics)
 
 
 def _optics(record: ViewRecord) -> ViewOptics:

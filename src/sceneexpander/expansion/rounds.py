@@ -31,7 +31,7 @@ from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.artifacts.views import ViewSet, to_bytes
 from sceneexpander.expansion.cameras import announce_cameras, report_cameras, straighten_views
 from sceneexpander.expansion.loaded import LoadedModel
-from sceneexpander.expansion.optics import optics_of
+from sceneexpander.expansion.optics import known_of, optics_of
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
 from sceneexpander.geometry.gauge import in_gauge_of, posed_in_both
@@ -80,10 +80,13 @@ def views_priors(
     seed: int,
     known: KnownCameras | None = None,
 ) -> tuple[Priors, SparseReconstruction | None]:
-    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing."""
+    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing.
+
+    ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told.
+    """
     if not loaded.uses_front_end:
         return Priors(), None
-    complete = known is not None and known.world_from_cam is not None
+    known = known_of(views, known)
     if any(
         record.distortion != (0.0, 0.0) for record in views.records
     ):  # straightened before; what is left is nothing to look for
@@ -94,7 +97,7 @@ def views_priors(
         generator=child_generator(seed, "frontend"),
         feature_images=views.detail_images,
         known_intrinsics_px=None if known is None else known.intrinsics_px,
-        known_world_from_cam=known.world_from_cam if complete and known is not None else None,
+        known_world_from_cam=None if known is None else known.world_from_cam,
         names=[record.name for record in views.records],
         optics=optics_of(views),
         valid=views.valid,
@@ -129,7 +132,7 @@ def initial_state(
         on_step=on_step,
     )
     weights = WeightsChange.between(loaded.base, loaded.state())
-    state = ExpansionState(views=views, priors=priors, weights=weights)
+    state = ExpansionState(views=views, priors=priors, weights=weights, known=scene.known)
     return state, reconstruct(state.views, priors, loaded, weights, method="captured"), sparse, report
 
 
@@ -188,7 +191,7 @@ def joint_reconstruction(
     the state's, so that what was known before can be compared with them; the front-end's own findings are in their own scale.
     """
     views = state.views.append(inserted.view)
-    priors, sparse = views_priors(views, loaded, frontend, seed=seed)
+    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known)
     priors = in_gauge_of(state.priors, priors)
     if sparse is not None:
         announce_cameras(
@@ -240,8 +243,7 @@ def correct_round(
 def aligned(inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig, *, seed: int) -> RoundInputs:
     """What the adaptation takes instead of the given estimate and picture: `realigned_priors`, and the photos' tone (`match_tone`)."""
     priors, corrections = realigned_priors(inputs, loaded, config.realign, seed=seed)
-    moved = captured_moved(inputs.state.priors, priors)
-    inputs = replace(inputs, joint_priors=priors, corrections=replace(corrections, captured_moved=moved))
+    inputs = replace(inputs, joint_priors=priors, corrections=corrections)
     return toned(inputs, loaded) if config.tone else inputs
 
 
@@ -291,8 +293,7 @@ def adapted_weights(
 ) -> tuple[WeightsChange, AdaptationResult]:
     """Algorithm 1 alone, on inputs as `aligned` leaves them; without a step where `Spend` does not want any."""
     state = inputs.state
-    if not worth_adapting(inputs, config):
-        _log.info("the insertion left the captured geometry as it was: no steps")
+    if config.steps and not worth_adapting(inputs, loaded, config):
         config = replace(config, steps=0)
     loaded.apply(state.weights)
     result = adapt(
@@ -315,12 +316,20 @@ def adapted_weights(
     return (WeightsChange.between(loaded.base, result.student) if config.steps else state.weights), result
 
 
-def worth_adapting(inputs: RoundInputs, config: AdaptConfig) -> bool:
-    """Whether the round runs its steps, see `Spend`. Where nothing is known of the geometry before, it does."""
+def worth_adapting(inputs: RoundInputs, loaded: LoadedModel, config: AdaptConfig) -> bool:
+    """Whether the round runs its steps, see `Spend`: told by what the weights it starts from make of all views."""
     if config.spend is Spend.ALWAYS:
         return True
-    moved = captured_moved(inputs.state.priors, inputs.joint_priors)
-    return moved is None or moved > config.spend_above
+    seen = predict(inputs.views, inputs.joint_priors, loaded, inputs.state.weights)
+    if seen.depth is None:
+        raise ValueError("the anchors are compared with the depth head")
+    count, posed = len(inputs.state.views), inputs.joint_priors.posed
+    moved = captured_moved(inputs.anchors, seen.depth[:count].cpu(), None if posed is None else posed[:count])
+    worth = moved > config.spend_above
+    _log.info(
+        "the insertion moves the captured depth by %.2f %%: %s", 100 * moved, "steps" if worth else "nothing to repair"
+    )
+    return worth
 
 
 def finished_round(
@@ -346,6 +355,7 @@ def finished_round(
         weights=weights,
         first_weights=state.unadapted,
         toned=_joined(state.toned, inputs.toned),
+        known=state.known,
     )
     reconstruction = closed(reconstruction, config.close_gaps)
     return expanded, trusted(reconstruction, views.images) if config.trust else reconstruction

@@ -17,6 +17,7 @@ from sceneexpander.frontend.resection import intrinsics_through
 
 _LIMIT = 6.0  # times the noise: errors are counted up to here
 _MOST_MATCHES = 250  # used per other view
+_PARALLEL = 0.01  # sine of the angle between two rays below which they may as well meet in front as behind
 _ITERATIONS = 25
 _STEP = 1e-6  # of the numerical derivatives
 _PRIOR_INFLATION = 8.0  # as in mapping: that many correlated errors count as one
@@ -98,6 +99,19 @@ class EpipolarFit:
         by_other = np.einsum("mi,mij->mj", np.cross(view_rays, base), self._to_pixels)
         slope = np.sqrt((by_view**2).sum(1) + (by_other**2).sum(1))
         return algebraic / np.maximum(slope, 1e-12)
+
+    def behind(
+        self, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"], lens: Float[np.ndarray, " 5"]
+    ) -> Bool[np.ndarray, " match"]:
+        """Which matches meet behind one of the cameras. Rays that are nearly parallel meet nowhere for certain, and are not counted."""
+        world_from_pixel = rotation.T @ np.linalg.inv(intrinsics_through(self._start, self._shift_unit, lens))
+        view_rays = self._view @ world_from_pixel.T
+        base = self._centres + rotation.T @ translation
+        aa, bb, ab = (view_rays**2).sum(1), (self._rays**2).sum(1), (view_rays * self._rays).sum(1)
+        a_base, b_base = (view_rays * base).sum(1), (self._rays * base).sum(1)
+        across = aa * bb - ab**2
+        depths = np.stack([bb * a_base - ab * b_base, ab * a_base - aa * b_base])  # times ``across``, which is positive
+        return (depths < 0).any(0) & (across > _PARALLEL**2 * aa * bb)
 
     def judge(
         self, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"], lens: Float[np.ndarray, " 5"]

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from sceneexpander.frontend.bundle import LOG_FOCAL, SHIFT_X, SHIFT_Y
+from sceneexpander.frontend.bundle import LENS_PARAMETERS, LOG_FOCAL, SHIFT_X, SHIFT_Y
 from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, OtherView, held_lens
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.rival_poses import direction_changes_deg, largest_rival_angle_deg
 from sceneexpander.frontend.sfm_types import SfmConfig
 from sceneexpander.frontend.twoview import PairMatches, relative_pose
 
@@ -35,17 +36,23 @@ class ViewEvidence:
     """What speaks for a view's camera. NaN where it could not be asked.
 
     Attributes:
-        agreeing: share of its matches, as verified before any camera was known, that lie on the epipolar lines of the model.
+        agreeing: share of its matches, as verified before any camera was known, that lie on the epipolar lines of the model, before
+            both cameras.
         rotation_gap_deg: median over the other views of the angle between the model's relative rotation and that of the pair alone.
         direction_sigma_deg: median over the other views of how far the direction to them may be off (one standard deviation).
         lens_sigma_deg: how far the directions to the others move if its focal, or its centre if it was cropped, is off by as much as
             pictures alone leave it uncertain; 0 where they are shared or known from elsewhere.
+        rival_angle_deg: how far the directions to the others move if it stood where a flat surface would look the same; 0 where relief
+            rules that out.
+        spread_deg: how far the directions to the others move to cameras of another focal that explain the photos about as well.
     """
 
     agreeing: float
     rotation_gap_deg: float
     direction_sigma_deg: float
     lens_sigma_deg: float
+    rival_angle_deg: float
+    spread_deg: float
 
     def refusal(self, config: SfmConfig) -> str:
         """Why the camera cannot be believed; empty if it can."""
@@ -68,6 +75,16 @@ class ViewEvidence:
             return (
                 "the photos were taken from nearly one place: directions between cameras may be off by"
                 f" {min(2 * self.direction_sigma_deg, 180):.0f} degrees"
+            )
+        if self.rival_angle_deg > config.max_spread_deg:
+            return (
+                "what it shares with other photos is flat, and looks the same from another place:"
+                f" its direction may be off by {self.rival_angle_deg:.0f} degrees"
+            )
+        if self.spread_deg > config.max_spread_deg:
+            return (
+                "cameras with another focal explain the photos about as well:"
+                f" its direction may be off by {self.spread_deg:.0f} degrees"
             )
         return ""
 
@@ -97,6 +114,8 @@ def weigh_evidence(
             lens_sigma_deg=_lens_sigma_deg(
                 mapping, view, features, pairs, _own_parameters(mapping, view, hinted=hinted[view])
             ),
+            rival_angle_deg=_rival_angle_deg(mapping, view, features, pairs),
+            spread_deg=float(mapping.spread_deg[view]),
         )
     return found
 
@@ -131,8 +150,9 @@ def _agreeing_share(mapping: Mapping, view: int, features: Sequence[Features], p
     if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
         return float("nan")
     fit = EpipolarFit(others, mapping.intrinsics[view], np.ones(2), noise_px=1.0)
-    errors = fit.errors_px(mapping.rotations[view], mapping.translations[view], np.zeros(5))
-    return float((np.abs(errors) < _AGREE_PX * mapping.unit_px).mean())
+    pose = mapping.rotations[view], mapping.translations[view], np.zeros(LENS_PARAMETERS)
+    near = np.abs(fit.errors_px(*pose)) < _AGREE_PX * mapping.unit_px
+    return float((near & ~fit.behind(*pose)).mean())
 
 
 def _direction_sigma_deg(mapping: Mapping) -> Float[np.ndarray, "view view"]:
@@ -179,6 +199,32 @@ def _lens_sigma_deg(
     others = other_views(mapping, view, features, pairs)
     if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
         return 180.0
+    fit, best = _own_fit(mapping, view, others)
+    worst = 0.0
+    for parameter in parameters:
+        low, high = (_end_of(fit, best, parameter, sign) for sign in (-1.0, 1.0))
+        worst = max(worst, float(np.median(direction_changes_deg(low, high, others))) / 2)
+    return worst
+
+
+def _rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
+    others = other_views(mapping, view, features, pairs)
+    if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
+        return 0.0
+    fit, best = _own_fit(mapping, view, others)
+    return largest_rival_angle_deg(
+        fit,
+        best,
+        others,
+        mapping.intrinsics[view],
+        threshold_px=mapping.config.epipolar_px * mapping.unit_px,
+        still_fits=_STILL_FITS,
+        seed=mapping.seed,
+    )
+
+
+def _own_fit(mapping: Mapping, view: int, others: Sequence[OtherView]) -> tuple[EpipolarFit, EpipolarView]:
+    """The view's matches with the others, and the pose that fits them best with the lens it has."""
     fit = EpipolarFit(
         others,
         mapping.start_intrinsics[view],
@@ -186,17 +232,7 @@ def _lens_sigma_deg(
         noise_px=_NOISE_PX * mapping.unit_px,
     )
     lens = mapping.lenses.resolved[mapping.lens_of[view]]
-    best = fit.refine(mapping.rotations[view], mapping.translations[view], lens, held_lens())
-    worst = 0.0
-    for parameter in parameters:
-        ends = [_end_of(fit, best, parameter, sign) for sign in (-1.0, 1.0)]
-        centres = [-end.rotation.T @ end.translation for end in ends]
-        angles = []
-        for other in others:
-            a, b = (centre + other.rotation.T @ other.translation for centre in centres)
-            angles.append(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)) / 2)
-        worst = max(worst, float(np.median(angles)))
-    return worst
+    return fit, fit.refine(mapping.rotations[view], mapping.translations[view], lens, held_lens())
 
 
 def _end_of(fit: EpipolarFit, best: EpipolarView, parameter: int, sign: float) -> EpipolarView:

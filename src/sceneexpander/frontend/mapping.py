@@ -7,6 +7,7 @@ pruning keep it consistent. All poses are ``cam_from_world``; pixels are those o
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,7 @@ from sceneexpander.frontend.twoview import (
     triangulate_pair,
 )
 
+_TAIL = 4.0  # nu of what is assumed of a focal: at four standard deviations it pulls a fifth as much as a Gaussian
 _PRIOR_INFLATION = 8.0  # matching errors are correlated and partly systematic: that many of them count as one
 _NEIGHBOURS = 8
 _NEIGHBOUR_GAP = 0.2  # of the logarithm of depth: neighbours nearer than this agree
@@ -62,6 +64,7 @@ class Mapping:
         lenses: what views of one lens share, relative to the start intrinsics. ``free`` says what may be refined once there are views
             enough. Distortion stays zero here: pixels are undistorted before they come in.
         prior_sigma: standard deviations of the priors in ``lenses`` (inf: none); their weight follows the noise.
+        assumed: lenses whose focal prior is no more than what is usual. Its tails are heavy: tele lenses exist.
         lens_guesses: per view of another lens than most, further factors (logarithms) that its start focal may be off by.
         crops: the views that may be parts cut out of pictures of the main lens.
         main: a view with the lens that most views have.
@@ -81,6 +84,7 @@ class Mapping:
         shift_unit_px: Float[np.ndarray, "view 2"] | None = None,
         lenses: Lenses | None = None,
         prior_sigma: Float[np.ndarray, "lens 5"] | None = None,
+        assumed: Bool[np.ndarray, " lens"] | None = None,
         guesses: dict[int, tuple[float, ...]] | None = None,
         crops: dict[int, CropOfMain] | None = None,
         main: int = 0,
@@ -94,6 +98,8 @@ class Mapping:
         self.shift_unit_px = np.full((views, 2), long_side) if shift_unit_px is None else shift_unit_px
         self.lenses = Lenses.nominal(views) if lenses is None else lenses
         self.prior_sigma = np.full((views, LENS_PARAMETERS), np.inf) if prior_sigma is None else prior_sigma
+        self.assumed = np.zeros(views, bool) if assumed is None else assumed
+        self.spread_deg = np.zeros(views)  # how far directions move to cameras that explain the photos about as well
         self.lens_guesses = {} if guesses is None else guesses
         self.crops = {} if crops is None else crops
         self.main = main
@@ -174,6 +180,7 @@ class Mapping:
         self.registered = other.registered.copy()
         self.lens_of, self.lenses, self.lens_sigma = other.lens_of.copy(), other.lenses, other.lens_sigma
         self.prior_sigma, self.penalty, self.main = other.prior_sigma, other.penalty, other.main
+        self.assumed, self.spread_deg = other.assumed.copy(), other.spread_deg.copy()
 
     def triangulate(self, *, threshold_px: float) -> None:
         """Find points for tracks that have none, from the best pair of their views.
@@ -318,6 +325,15 @@ class Mapping:
         values[row], focal_of[row], offset[row] = lens, row, 0.0
         self.lenses = replace(self.lenses, values=values, focal_of=focal_of, offset=offset)
 
+    def move_main_focal(self, log_factor: float) -> None:
+        """Multiply the main focal, and those that follow it, by exp(log_factor), within bounds."""
+        row = self.lens_of[self.main]
+        values = self.lenses.values.copy()
+        values[row, LOG_FOCAL] = np.clip(
+            values[row, LOG_FOCAL] + log_factor, self.lenses.low[row, LOG_FOCAL], self.lenses.high[row, LOG_FOCAL]
+        )
+        self.lenses = replace(self.lenses, values=values)
+
     def split_lens(self, view: int) -> None:
         """Make a view a lens of its own, with the values of the one it had and little held against another focal."""
         old = int(self.lens_of[view])
@@ -328,7 +344,7 @@ class Mapping:
             self.main = int(others[0])
         names = ("values", "free", "low", "high", "prior", "focal_of", "offset")
         tables = {name: getattr(self.lenses, name).copy() for name in names}
-        tables["sigma"] = self.prior_sigma.copy()
+        tables["sigma"], tables["assumed"] = self.prior_sigma.copy(), self.assumed.copy()
         if old == view:  # the lens goes on under the number of another view that has it
             heir = int(others[0])
             for table in tables.values():
@@ -340,11 +356,11 @@ class Mapping:
         for table in tables.values():
             table[view] = table[old]
         tables["focal_of"][view], tables["offset"][view] = view, 0.0
-        tables["free"][view, LOG_FOCAL] = True
+        tables["free"][view, LOG_FOCAL], tables["assumed"][view] = True, False
         tables["sigma"][view, LOG_FOCAL] = self.config.split_focal_sigma
         tables["prior"][view, LOG_FOCAL] = tables["values"][old, LOG_FOCAL]
         self.lens_of[view] = view
-        self.prior_sigma = tables.pop("sigma")
+        self.prior_sigma, self.assumed = tables.pop("sigma"), tables.pop("assumed")
         self.lenses = replace(self.lenses, **tables)
         self.penalty += self.config.split_penalty
 
@@ -500,7 +516,7 @@ class Mapping:
                 self.lenses,
                 values=self.lenses.values if values is None else values,
                 free=lens_free,
-                weight=_PRIOR_INFLATION * (noise / prior_sigma) ** 2,
+                weight=_PRIOR_INFLATION * (noise / prior_sigma) ** 2 / self._tail(prior_sigma),
             ),
             shift_unit_px=self.shift_unit_px,
             robust_px=noise,
@@ -511,5 +527,29 @@ class Mapping:
         limit = self.config.inlier_px * self.unit_px
         explained = np.maximum(1.0 - (self.errors_px()[self.active & self.registered] / limit) ** 2, 0.0).sum()
         used = np.unique(self.lens_of[self.registered])
-        pulls = ((self.lenses.values - self.lenses.prior) / self.prior_sigma)[used]
-        return float(explained - _PRIOR_INFLATION * (pulls**2).sum() / 2 - self.penalty)
+        pulls = ((self.lenses.values - self.lenses.prior) / self.prior_sigma)[used] ** 2
+        tail = self._tail(self.prior_sigma)[used]
+        pulls = np.where(tail > 1, pulls * np.log(tail) / (tail - 1).clip(1e-12), pulls)  # nu log(1 + pull / nu)
+        return float(explained - _PRIOR_INFLATION * pulls.sum() / 2 - self.penalty)
+
+    def _tail(self, prior_sigma: Float[np.ndarray, "lens 5"]) -> Float[np.ndarray, "lens 5"]:
+        """By how much each prior's pull is weakened at the present values: 1 + pull^2 / nu of Student's distribution, 1 for a Gaussian."""
+        tail = np.ones_like(prior_sigma)
+        pull = (self.lenses.values[:, LOG_FOCAL] - self.lenses.prior[:, LOG_FOCAL]) / prior_sigma[:, LOG_FOCAL]
+        tail[self.assumed, LOG_FOCAL] += pull[self.assumed] ** 2 / _TAIL
+        return tail
+
+
+def directions_between_deg(model: Mapping, others: Sequence[Mapping]) -> Float[np.ndarray, " view"]:
+    """Per view the median over its neighbours of how far the direction to them moves, in the other model in which that is most; degrees."""
+    views, most = np.flatnonzero(model.registered), np.zeros(len(model.registered))
+    for other in others:
+        for view in views:
+            turned = []
+            for neighbour in views:
+                if neighbour == view or not (other.registered[view] and other.registered[neighbour]):
+                    continue
+                a, b = (m.rotations[view] @ (m.centres[neighbour] - m.centres[view]) for m in (model, other))
+                turned.append(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+            most[view] = max(most[view], float(np.median(turned)) if turned else 0.0)
+    return most

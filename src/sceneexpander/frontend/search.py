@@ -16,7 +16,7 @@ from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.lens_tests import find_apart_group, mean_cost, pair_costs, settle_lenses, snap_lenses
 from sceneexpander.frontend.lenses import FocalStart, LensPlan
-from sceneexpander.frontend.mapping import CropOfMain, Mapping
+from sceneexpander.frontend.mapping import CropOfMain, Mapping, directions_between_deg
 from sceneexpander.frontend.sfm_setup import KnownCameras, Setup
 from sceneexpander.frontend.sfm_types import FocalSource, PairKind, SfmConfig
 from sceneexpander.frontend.tracks import Tracks, build_tracks
@@ -33,6 +33,10 @@ _STRANGE = (
     3.0  # times what is usual among the others: a view that even a lens of its own does not bring together with them
 )
 _BETTER = 0.8  # of what stayed unexplained before
+_AS_GOOD = 0.98  # of the score
+_UNCERTAIN_FOCAL = 0.015  # standard deviation of its logarithm, beyond which other focals are tried
+_FOCAL_JUMP = 0.2  # of the logarithm
+_MOST_JUMPS = 6
 _MIN_COMMON = 8  # points two views must share before their matches are worth finding again
 
 
@@ -77,6 +81,9 @@ class CameraSearch:
             model = guided
         if refine:
             return model, FocalSource.REFINED
+        if self.plan.refine:
+            others = [self._moved(model, sign * start.sigma) for sign in (-1, 1)]
+            model.spread_deg = np.maximum(model.spread_deg, directions_between_deg(model, others))
         return model, start.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)
 
     def _without_points(self, tracks: Tracks) -> tuple[Mapping, FocalSource]:
@@ -135,6 +142,8 @@ class CameraSearch:
         several = min(int(model.registered.sum()), self.found.distinct) >= self.config.min_views_for_focal
         attempted = self.plan.refine and (several or self._hinted(start))
         refine = self._finish(model, attempted)
+        if refine:
+            model = self._with_focal_elsewhere(model)
         for _ in range(self.config.lens_rounds if refine else 0):
             freer = model.copy()
             if not settle_lenses(freer, self.features, self.pairs):
@@ -148,6 +157,38 @@ class CameraSearch:
         if refine and snap_lenses(model):
             refine = self._finish(model, refine)
         return model, start, refine, attempted
+
+    def _with_focal_elsewhere(self, model: Mapping) -> Mapping:
+        """The model, or a better one at another main focal, where that is uncertain; it knows what other cameras would do as well.
+
+        Through a long lens a nearer and flatter scene looks nearly the same; adjustment creeps along such a valley, and what it prunes
+        on the way keeps it where it is.
+        """
+        found, tried = [model], [float(model.log_focal[model.main])]
+        while model.lens_sigma[model.lens_of[model.main], LOG_FOCAL] > _UNCERTAIN_FOCAL and len(tried) <= _MOST_JUMPS:
+            for jump in (_FOCAL_JUMP, -_FOCAL_JUMP):
+                target = float(model.log_focal[model.main]) + jump
+                if min(abs(target - other) for other in tried) > _FOCAL_JUMP / 2:
+                    tried.append(target)
+                    other = self._moved(model, jump)
+                    if self._finish(other, True):
+                        found.append(other)
+            best = max(found, key=Mapping.score)
+            if best is model:
+                break
+            _log.debug("another focal: score %.1f -> %.1f", model.score(), best.score())
+            model = best
+        as_good = [other for other in found if other.score() > _AS_GOOD * model.score()]
+        model.spread_deg = directions_between_deg(model, as_good)
+        _log.debug("%d of %d cameras tried are as good, spread %s", len(as_good), len(found), model.spread_deg.round(1))
+        return model
+
+    def _moved(self, model: Mapping, jump: float) -> Mapping:
+        """The model settled at another main focal, which is held."""
+        other = model.copy()
+        other.move_main_focal(jump)
+        other.finish(refine_focal=False, free=self._free_views(other))
+        return other
 
     def _with_groups_apart(self, tracks: Tracks, model: Mapping) -> Mapping:
         """The model, or a better one in which a group of views that does not go with the rest has a lens of its own."""
@@ -203,6 +244,7 @@ class CameraSearch:
         views = len(plan.lens_of)
         lenses = Lenses.nominal(views)
         sigma = np.full(lenses.values.shape, np.inf)
+        assumed = np.zeros(views, bool)
         ratios = intrinsics[:, 0, 0] / plan.units_px[:, 0]
         low, high = config.focal_bounds
         # A given focal outside the bounds is believed, and stays where it is.
@@ -216,6 +258,7 @@ class CameraSearch:
             if plan.known is not None or lens == plan.main:
                 lenses.prior[view, LOG_FOCAL] = np.log(start.prior / start.ratio)
                 sigma[view, LOG_FOCAL] = start.sigma
+                assumed[view] = plan.known is None and start.source is None
                 continue
             likely = plan.guesses(view, start.ratio)
             guesses[view] = tuple(float(np.log(other / likely[0])) for other in likely[1:])
@@ -238,6 +281,7 @@ class CameraSearch:
             shift_unit_px=plan.units_px,
             lenses=lenses,
             prior_sigma=sigma,
+            assumed=assumed,
             guesses=guesses,
             crops=crops,
             main=plan.main,

@@ -32,9 +32,7 @@ class ReplayGenerator:
 
     context: GenerationContext
 
-    def generate(
-        self, references: ViewSet, prompt: str, *, count: int, size_hint: tuple[int, int], seed: int | None
-    ) -> list[Candidate]:
+    def generate(self, references: ViewSet, prompt: str) -> list[Candidate]:
         """All recorded pictures, in natural order. See `ViewGenerator`."""
         context = self.context
         where = f"round {context.round_number} of {context.scene_folder}"
@@ -62,9 +60,7 @@ class FileGenerator:
 
     context: GenerationContext
 
-    def generate(
-        self, references: ViewSet, prompt: str, *, count: int, size_hint: tuple[int, int], seed: int | None
-    ) -> list[Candidate]:
+    def generate(self, references: ViewSet, prompt: str) -> list[Candidate]:
         """The one picture. Relative paths start at the working directory. See `ViewGenerator`."""
         given = self.context.config.file
         if not given:

@@ -17,14 +17,12 @@ class GeneratorConfig:
     Attributes:
         backend: name of the back-end, see `sceneexpander.generation.backends`.
         file: the picture that the back-end ``file`` takes; ``{round}`` in it becomes the round's number.
-        count: how many candidates to ask for; back-ends with stored pictures deliver all that they have.
         candidate: which candidate is inserted, counted from 0 in the order of the contact sheet.
         fit: how a candidate is brought to the captured ratio: ``crop`` or ``pad`` (letterbox on grey).
     """
 
     backend: str = "replay"
     file: str | None = None
-    count: Annotated[int, Range(1, 100)] = 1
     candidate: Annotated[int, Range(0, 1000)] = 0
     fit: Fit = "crop"
 

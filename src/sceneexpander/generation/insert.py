@@ -45,8 +45,6 @@ def generate_inserted_view(
     views: ViewSet,
     scene_folder: Path,
     config: GeneratorConfig,
-    *,
-    seed: int | None = None,
 ) -> tuple[InsertedView, Float[Tensor, "3 height width"]]:
     """The picture that round ``round_number`` inserts, in the frame of the views so far, and a contact sheet of all candidates.
 
@@ -59,16 +57,13 @@ def generate_inserted_view(
         views: captured views and those inserted in earlier rounds; the new view gets their sizes.
         scene_folder: the user's folder, where recorded pictures are.
         config: back-end, choice and fit.
-        seed: for back-ends that can be seeded.
 
     Raises:
         UserError: unknown back-end, no picture, or the chosen candidate does not exist or is unusable.
     """
     spec = scene.round_spec(round_number)
     context = GenerationContext(scene_folder=scene_folder, round_number=round_number, spec=spec, config=config)
-    candidates = make_generator(context).generate(
-        views, fill_prompt(spec), count=config.count, size_hint=(views.height, views.width), seed=seed
-    )
+    candidates = make_generator(context).generate(views, fill_prompt(spec))
     if config.candidate >= len(candidates):
         raise UserError(
             f"is {config.candidate}, but round {round_number} has {len(candidates)} candidate(s)",
@@ -106,8 +101,6 @@ def generate_inserted_view(
 
 def _assess(candidate: Candidate, views: ViewSet, frame: FrameSize, fit: Fit) -> _Assessed:
     source = candidate.provenance.source
-    if candidate.data is None:
-        return _Assessed(name=candidate.name, provenance=candidate.provenance)
     try:
         picture = decode_picture(candidate.data, name=candidate.name, where=source)
         check_content(picture, source)

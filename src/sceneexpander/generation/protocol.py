@@ -14,9 +14,9 @@ from sceneexpander.generation.config import GeneratorConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
-    """One answer of a back-end. ``data`` is the picture file as received, or None if there is none (``provenance.refusal`` says why)."""
+    """One answer of a back-end. ``data`` is the picture file as received."""
 
-    data: bytes | None
+    data: bytes
     name: str  # as a file name
     provenance: Provenance
 
@@ -34,23 +34,12 @@ class GenerationContext:
 class ViewGenerator(Protocol):
     """Reference pictures and an instruction -> candidates. Secrets, if any, are read from the environment in `generate`, never kept."""
 
-    def generate(
-        self,
-        references: ViewSet,
-        prompt: str,
-        *,
-        count: int,
-        size_hint: tuple[int, int],
-        seed: int | None,
-    ) -> list[Candidate]:
+    def generate(self, references: ViewSet, prompt: str) -> list[Candidate]:
         """Make candidates.
 
         Args:
             references: the views so far, in order; the first one is the reference frame.
             prompt: the full instruction.
-            count: how many to make; a back-end with stored pictures returns all of them.
-            size_hint: wanted (height, width); what comes back may differ and is fitted later.
-            seed: for back-ends that can be seeded, else ignored.
 
         Returns:
             At least one candidate, in a stable order; partial success keeps what succeeded.

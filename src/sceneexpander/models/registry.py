@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -31,8 +31,11 @@ class BuiltReconstructor:
 def _mini(variant: str, weights: ResolvedWeights) -> Reconstructor:
     from sceneexpander.models.mini import Mini
 
-    _check_variant("mini", variant, (DEFAULT_VARIANT,))
-    return Mini.from_weights(weights.path)
+    _check_variant("mini", variant, (DEFAULT_VARIANT, "free_cameras"))
+    model = Mini.from_weights(weights.path)
+    if variant == "free_cameras":
+        model.config = replace(model.config, camera_gain=1.0)
+    return model
 
 
 def _worldmirror(variant: str, weights: ResolvedWeights) -> Reconstructor:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -175,7 +176,7 @@ def load_weights(model: nn.Module, path: Path) -> None:
     A model built on the meta device ends up on the CPU without a second copy in memory.
 
     Raises:
-        UserError: one line with the first names that are missing, unexpected or of another shape.
+        UserError: one line with the first names that are missing, unexpected, of another shape or not finite.
     """
     tensors = read_tensors(path)
     expected = model.state_dict()
@@ -187,6 +188,10 @@ def load_weights(model: nn.Module, path: Path) -> None:
         raise UserError(
             f"does not fit the model: {problem}", where=path, fix="check that weights and configuration agree"
         )
+    broken = [name for name, value in sorted(tensors.items()) if not bool(torch.isfinite(value).all())]
+    if broken:
+        problem = f"{len(broken)} tensors hold values that are not finite ({', '.join(broken[:SHOWN_NAMES])})"
+        raise UserError(problem, where=path, fix="fetch or export the weights again")
     cast = {name: value.to(expected[name].dtype) for name, value in tensors.items()}
     model.load_state_dict(cast, strict=True, assign=any(value.is_meta for value in expected.values()))
 

@@ -8,12 +8,14 @@ before that band limit (`sceneexpander.geometry.sampling`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from sceneexpander.errors import UserError
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.sampling import BAND_LIMIT_PX
 from sceneexpander.optimisation.config import RatesConfig
@@ -115,10 +117,21 @@ class Splats:
         )
 
     def step(self) -> None:
-        """One step of every optimiser, after a backward pass."""
+        """One step of every optimiser, after a backward pass.
+
+        Raises:
+            UserError: a value left the range of numbers, which rates that are too high do.
+        """
         for optimiser in self.optimisers.values():
             optimiser.step()
             optimiser.zero_grad(set_to_none=True)
+        for name in self.optimisers:
+            value = self.scales if name == "scales" else self.params[name]
+            # One sum instead of a mask per value: NaN and infinity survive it.
+            if not math.isfinite(float(value.detach().sum())):
+                raise UserError(
+                    f"{name} of the Gaussians are no longer finite", where="fit", fix="lower its learning rates"
+                )
 
     @torch.no_grad()
     def rearrange(self, rows: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None:

@@ -236,11 +236,21 @@ def _open(config: TrackingConfig, root: Path) -> tuple[Any, str]:
 
 
 def last_experiment(root: Path) -> str:
-    """Id of the local store's experiment with the latest run, straight from the database; the first one that is made, without runs."""
-    query = "SELECT experiment_id FROM runs WHERE lifecycle_stage = 'active' ORDER BY start_time DESC LIMIT 1"
+    """Id of the local store's experiment with the pipeline's latest run, straight from the database.
+
+    Runs of the pipeline have a key, or the mark of a running adaptation; a training or anything else that uses the store has neither.
+    Without any, the experiment with the pipeline's default name, or the first one that is made.
+    """
+    latest = """
+        SELECT runs.experiment_id FROM runs
+        JOIN tags ON tags.run_uuid = runs.run_uuid AND tags.key IN (?, ?)
+        WHERE runs.lifecycle_stage = 'active' ORDER BY runs.start_time DESC LIMIT 1
+    """
+    named = "SELECT experiment_id FROM experiments WHERE name = ?"
     try:
         with contextlib.closing(sqlite3.connect(database_path(root))) as database:
-            found = database.execute(query).fetchone()
+            found = database.execute(latest, (KEY_TAG, LIVE_TAG)).fetchone()
+            found = found or database.execute(named, (TrackingConfig().experiment,)).fetchone()
     except sqlite3.DatabaseError:
         found = None
     return "1" if found is None else str(found[0])  # 0 is MLflow's own default

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from sceneexpander.adaptation.acceptance import Acceptance, AcceptanceLimits, judge_candidate
+from sceneexpander.adaptation.acceptance import Acceptance, AcceptanceLimits, captured_moved, judge_candidate
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.priors import Priors
 from tests.unit.adaptation.test_realign import VIEWS, moved, world
@@ -63,3 +64,32 @@ def test_a_view_without_a_camera_is_named(world: World) -> None:
     assert not found.accepted
     assert found.depth_conflict is None
     assert any("no camera" in reason for reason in found.reasons)
+
+
+def test_what_the_insertion_moves_is_the_mean_log_change_of_captured_depth(world: World) -> None:
+    _, anchors, _ = world
+    depth = anchors.depth.clone()
+    assert captured_moved(anchors, depth) == 0
+    depth[1] *= 1.2
+    depth[2] /= 1.5
+    whole = (math.log(1.2) + math.log(1.5)) / VIEWS
+    assert captured_moved(anchors, depth) == pytest.approx(whole, rel=1e-4)
+    placeholder = torch.tensor([True, True, False])
+    assert captured_moved(anchors, depth, placeholder) == pytest.approx(math.log(1.2) / 2, rel=1e-4)
+    nothing = torch.zeros(VIEWS, dtype=torch.bool)
+    assert captured_moved(anchors, depth, nothing) == pytest.approx(whole, rel=1e-4)
+
+
+def test_a_turn_is_measured_between_cameras_that_were_estimated_both_times(world: World) -> None:
+    """Not against a first view that is a placeholder, nor of one."""
+    priors = world[0]
+    assert priors.world_from_cam is not None
+    turned = moved(priors.select([1, 2, VIEWS, 0]), 20.0, 1.0).select([3, 0, 1, 2])  # the first captured camera
+    lost = replace(turned, posed=torch.tensor([False] + [True] * VIEWS))
+    assert judge(world, turned).cameras_moved_deg == pytest.approx(20.0, abs=0.05)
+    found = judge(world, lost)
+    assert found.cameras_moved_deg < 0.01
+    # Estimates in two frames turn nothing.
+    about = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    other = replace(lost, world_from_cam=about @ lost.world_from_cam)
+    assert judge(world, other).cameras_moved_deg < 0.05

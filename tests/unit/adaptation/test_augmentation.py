@@ -7,6 +7,7 @@ from sceneexpander.adaptation.augmentation import (
     draw_mode,
     draw_warp,
     identity_grid,
+    random_affine,
     warp_grid,
 )
 from sceneexpander.adaptation.config import AugmentConfig
@@ -86,3 +87,34 @@ def test_rotation_is_a_rotation_for_any_aspect() -> None:
 def test_probabilities_must_sum_to_one() -> None:
     with pytest.raises(ValueError, match="sum to 1"):
         AugmentConfig(identity=0.5)
+
+
+def test_blocks_move_as_strongly_as_configured() -> None:
+    def mean_move(strength: float) -> float:
+        config = AugmentConfig(block_strength=strength)
+        moves = [
+            (warp_grid(Mode.BLOCK, config, 60, 80, _generator(seed)) - identity_grid(60, 80)).norm(dim=-1).mean()
+            for seed in range(5)
+        ]
+        return float(torch.stack(moves).mean())
+
+    assert mean_move(1.0) == pytest.approx(2 * mean_move(0.5), rel=0.1)
+    assert mean_move(0.0) < 1e-6
+
+
+def test_every_kind_of_motion_is_in_an_affine_map_as_strongly_as_configured() -> None:
+    limits = {"rotation_deg": 5.0, "translation": 0.05, "scale": 0.1, "shear_deg": 5.0}
+    for kind, limit in limits.items():
+        config = AugmentConfig(**{**dict.fromkeys(limits, 0.0), kind: limit})
+        maps = random_affine(config, 400, 1.0, 1.5, _generator(1))
+        linear, shift = maps[:, :, :2], maps[:, :, 2]
+        off = (linear - torch.eye(2)).abs().amax((1, 2))
+        angle = torch.deg2rad(torch.tensor(limit))
+        # The largest of 400 uniform draws is within a few per cent of the limit.
+        expected = {"rotation_deg": angle.sin(), "scale": torch.tensor(limit).expm1(), "shear_deg": angle.tan()}
+        if kind == "translation":
+            assert float(off.max()) < 1e-6
+            assert shift.abs().amax(0).tolist() == pytest.approx([2 * limit * 1.5, 2 * limit], rel=0.03)
+        else:
+            assert float(off.max()) == pytest.approx(float(expected[kind]), rel=0.04)
+            assert float(shift.abs().max()) == 0

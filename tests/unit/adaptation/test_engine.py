@@ -75,6 +75,19 @@ def test_chunks_of_views_change_nothing_but_rounding(make: object) -> None:
         assert chunked.gradient_norm == pytest.approx(plain.gradient_norm, rel=1e-4)
 
 
+def test_gaussians_among_the_anchors_reach_their_head() -> None:
+    config = replace(STEPS, steps=2, insertion_probability=0.0, restore_interval=0)
+    for weight, reached in ((0.0, False), (1.0, True)):
+        model, inputs = _mini()
+        before = {name: value.clone() for name, value in model.state_dict().items()}
+        result = adapt(model, inputs, replace(config, alpha_gaussian=weight), seed=0)
+        moved = [
+            not torch.equal(before[n], v) for n, v in result.student.items() if n.startswith("network.gaussian_head")
+        ]
+        assert any(moved) == reached
+        assert (result.records[-1].anchor_gaussian > 0) == reached
+
+
 @pytest.mark.parametrize("make", [_worldmirror, _mini], ids=["worldmirror", "mini"])
 def test_theta_0_on_the_host_changes_no_bit(make: object) -> None:
     plain = _run(make, STEPS)

@@ -224,3 +224,47 @@ def test_eight_bit_moments_follow_float32_ones_closely() -> None:
     assert float(torch.nn.functional.cosine_similarity(byte, full, dim=0)) > 0.998
     kept = sum(value.numel() * value.element_size() for value in moments[1].state().values())
     assert kept < 0.27 * sum(value.numel() * value.element_size() for value in moments[0].state().values())
+
+
+@pytest.mark.parametrize("form", list(MomentsForm))
+def test_a_parameter_without_a_gradient_stays_whatever_its_neighbours_do(form: MomentsForm) -> None:
+    """In torch's AdamW a step counts for those that have a gradient only."""
+    config = replace(PLAIN, weight_decay=0.1, engine=EngineConfig(moments=form))
+    bag, teacher, ledger = _ledger(config)
+    mirror = [p.clone().requires_grad_(True) for p in bag.numbers()]
+    optimiser = torch.optim.AdamW(mirror, lr=config.learning_rate, weight_decay=config.weight_decay)
+    everything = tuple(range(len(SHAPES)))
+    for step, only in enumerate((everything, (0, 3), everything, (1, 4), everything), start=1):
+        before, taught = bag.numbers(), teacher.numbers()
+        gradients = bag.give_gradients(step, only=only)
+        for index, parameter in enumerate(mirror):
+            parameter.grad = gradients[index].clone() if index in only else None
+        ledger.update(step)
+        optimiser.step()
+        for index, (old, new) in enumerate(zip(before, bag.numbers(), strict=True)):
+            assert torch.equal(old, new) == (index not in only)
+        momentum = config.ema_momentum
+        for old, new, student in zip(taught, teacher.numbers(), bag.numbers(), strict=True):
+            torch.testing.assert_close(new, momentum * old + (1 - momentum) * student, atol=1e-6, rtol=0)
+    assert {name for bucket in ledger.buckets for name in bucket.names} == {f"items.{i}" for i in everything}
+    if form is MomentsForm.FP32:
+        for ours, exact in zip(bag.numbers(), mirror, strict=True):
+            torch.testing.assert_close(ours, exact.detach(), atol=2e-6, rtol=1e-5)
+
+
+def test_a_split_ledger_is_resumed_as_it_was() -> None:
+    ledgers_of = []
+    for resumed in (False, True):
+        bag, teacher, ledger = _ledger()
+        for step, only in enumerate(((0, 1, 2, 3, 4), (0, 3)), start=1):
+            bag.give_gradients(step, only=only)
+            ledger.update(step)
+        if resumed:
+            saved = [(names, {k: v.clone() for k, v in tensors.items()}) for names, tensors in ledger.state()]
+            bag, teacher, ledger = _ledger()
+            ledger.load(saved)
+        bag.give_gradients(3)
+        ledger.update(3)
+        ledgers_of.append((bag, teacher))
+    for one, other in zip(*ledgers_of, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(one.numbers(), other.numbers(), strict=True))

@@ -16,6 +16,7 @@ from sceneexpander.adaptation.loop import (
 )
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.store import sha256_of_tensors
+from sceneexpander.errors import UserError
 from tests.support.tiny_model import TinyReconstructor, tiny_images
 
 FAST = AdaptConfig(
@@ -228,8 +229,10 @@ def test_restored_counts_appear_every_k_steps() -> None:
 def test_a_non_finite_loss_stops_the_run_and_names_the_term() -> None:
     inputs = _inputs()
     poisoned = replace(inputs, inserted=torch.full_like(inputs.inserted, float("nan")))
-    with pytest.raises(NonFiniteLoss, match=r"at step \d+"):
+    with pytest.raises(NonFiniteLoss, match=r"at step \d+") as caught:
         _run(replace(FAST, insertion_probability=1.0), poisoned)
+    assert isinstance(caught.value, UserError), "one line and exit code 2 at every door"
+    assert "adapt.learning_rate" in caught.value.line()
 
 
 @pytest.mark.parametrize("change", [lambda i: replace(i, captured=i.captured[:3])])

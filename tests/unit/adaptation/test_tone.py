@@ -86,3 +86,19 @@ def test_what_is_clipped_to_white_stays_white() -> None:
     assert (darker.diff(dim=-1) > 0).all(), "brighter stays brighter"
     brighter = Tone(gains=(1.2, 1.2, 1.2), pairs=1).applied(image)
     torch.testing.assert_close(brighter, (1.2 * image).clamp(max=1))
+
+
+def test_a_photo_without_a_camera_has_no_say(views: SyntheticViews) -> None:
+    images = recoloured(views, (1.2, 1.2, 1.2))
+    images[0] *= 0.5
+    depth = torch.where(views.valid, views.depth, views.depth[views.valid].max())
+    cameras = views.world_from_cam, views.intrinsics_px
+
+    def gains(posed: list[bool]) -> Tone | None:
+        return match_tone(images, depth, *cameras, generated=GENERATED, posed=torch.tensor(posed), view=VIEWS)
+
+    found = gains([False, True, True, True])
+    assert found is not None
+    assert all(gain == pytest.approx(1 / 1.2, rel=0.04) for gain in found.gains)
+    assert gains([True, True, True, False]) is None
+    assert gains([False, False, False, True]) is None

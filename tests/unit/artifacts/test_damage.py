@@ -43,7 +43,7 @@ def lens_views() -> ViewSet:
 
 
 def inserted() -> InsertedView:
-    made = Provenance(backend="file", prompt="p", source="x.png", sha256="0", parameters={"a": "b"}, cost_usd=0.1)
+    made = Provenance(backend="file", prompt="p", source="x.png", sha256="0", parameters={"a": "b"}, refusal="r")
     return InsertedView(round=1, view=make_views(1, generated=True), chosen=0, provenance=(made,))
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sceneexpander.adaptation.config import AdaptConfig, Realign
+from sceneexpander.adaptation.config import AdaptConfig, Realign, Spend
 from sceneexpander.config.compose import FORBIDDEN_KEYS, compose, refuse_forbidden_keys, scene_option
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
@@ -97,15 +97,25 @@ def test_the_rows_of_the_papers_table_add_one_component_each() -> None:
     assert rows["self_distill"].restore_interval == 0
     assert rows["self_distill_p1"].insertion_probability == 1
     assert rows["full"].restore_interval > 0
-    # The default of the embedded model is the last row and four things beyond the paper.
-    assert (
-        replace(rows["full"], realign=Realign.CHOOSE, tone=True, trust=True, close_gaps=0.7) == typed(composed()).adapt
-    )
+    # The default of the embedded model is the last row, four things beyond the paper, and steps only where they can repair something.
+    beyond = {"realign": Realign.CHOOSE, "tone": True, "trust": True, "close_gaps": 0.7, "spend": Spend.WHERE_MOVED}
+    assert replace(rows["full"], **beyond) == typed(composed()).adapt
     for row in rows.values():
         assert (row.realign, row.splat_steps, row.inserted_weights) == ("none", 0, "uniform")
+        assert row.spend == "always" or row.steps == 0
+        assert row.alpha_gaussian == 0
         assert not row.tone
         assert not row.trust
         assert row.close_gaps == 0
+
+
+@pytest.mark.parametrize("model", ["mini", "worldmirror"])
+def test_the_papers_method_runs_all_its_steps_and_nothing_beyond(model: str) -> None:
+    chosen = typed(composed("method=paper", f"model={model}", *NEEDED.get(f"model={model}", []), "profile=gpu"))
+    rate = typed(composed("ablation=full")).adapt.learning_rate if model == "mini" else 1e-5
+    assert chosen.adapt == replace(AdaptConfig(), learning_rate=rate)
+    assert chosen.refine.visits == 0
+    assert typed(composed("method=paper")).adapt == typed(composed("ablation=full")).adapt
 
 
 def test_the_controls_take_away_what_they_say() -> None:
@@ -114,7 +124,7 @@ def test_the_controls_take_away_what_they_say() -> None:
     assert (without.insertion_probability, without.lambda_gen) == (0, 0)
     assert without.steps == full.steps > 0
     assert typed(composed("ablation=control_no_anchor")).adapt.lambda_anchor == 0 < full.lambda_anchor
-    only = typed(composed("ablation=control_no_adaptation")).adapt
+    only = typed(composed("ablation=corrected")).adapt
     assert replace(only, steps=full.steps) == full
     assert only.steps == 0
 
@@ -123,7 +133,6 @@ def test_the_gpu_profile_with_worldmirror_has_the_papers_values() -> None:
     config = typed(composed("profile=gpu", "model=worldmirror", "model.weights=x.safetensors"))
     paper = AdaptConfig()  # its defaults are the paper's, and are tested as such where they live
     assert config.adapt == paper
-    assert (paper.steps, paper.learning_rate, paper.insertion_probability) == (400, 1e-5, 0.5)
     assert config.device == "cuda"
     assert config.warmup.steps == 0
 

@@ -199,3 +199,22 @@ def test_non_finite_numbers_are_refused() -> None:
 def test_config_range() -> None:
     with pytest.raises(UserError, match="coverage_alpha"):
         EvaluateConfig(coverage_alpha=1.0)
+
+
+@pytest.mark.parametrize("lost_in", ["source", "target", "both"])
+def test_same_place_is_not_misled_by_placeholders_of_cameras(lost_in: str) -> None:
+    scene = made_reconstruction((0.0, 0.3, 0.6, 2.2))
+    poses, depth = scene.world_from_cam.clone(), scene.depth.clone()
+    poses[1], depth[1] = poses[0], 3 * depth[1]
+    posed = torch.tensor([True, False, True, True])
+    placeholder = dataclasses.replace(scene, world_from_cam=poses, depth=depth, posed=posed)
+    source = scene if lost_in == "target" else placeholder
+    target = scene if lost_in == "source" else placeholder
+    found = same_place(scene.world_from_cam[-1:], source, target)
+    torch.testing.assert_close(found, scene.world_from_cam[-1:], atol=1e-5, rtol=0)
+
+
+def test_same_place_without_any_camera_on_both_sides_takes_all() -> None:
+    scene = made_reconstruction()
+    lost = dataclasses.replace(scene, posed=torch.zeros(3, dtype=torch.bool))
+    torch.testing.assert_close(same_place(scene.world_from_cam, scene, lost), scene.world_from_cam, atol=1e-5, rtol=0)

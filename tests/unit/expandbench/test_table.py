@@ -14,11 +14,13 @@ from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
 from sceneexpander.expandbench.table import (
     COLUMNS,
     acceptance_table,
+    components_table,
     curve_table,
     main_table,
     mean_of,
     paired,
     row_names,
+    scenes_table,
     seed_spread,
 )
 
@@ -37,7 +39,7 @@ def cell(
 ) -> CellResult:
     return CellResult(
         scene=scene, grade=grade, row=row, seed=seed, steps=0, seconds=0.0, code="c",
-        numbers=replace(NUMBERS, own_psnr_db=psnr, psnr_db=psnr, depth_abs_rel=depth),
+        numbers=replace(NUMBERS, psnr_db=psnr, own_psnr_db=psnr, depth_abs_rel=depth),
     )  # fmt: skip
 
 
@@ -50,6 +52,8 @@ CELLS = [
     cell("b", "full", 21.9, seed=0, depth=0.06),
     cell("a", "full", 22.0, seed=1, depth=0.04),
     cell("b", "full", 21.9, seed=1, depth=0.06),
+    *(cell(scene, CAPTURED, value, seed=1, grade="") for scene, value in (("a", 21.2), ("b", 23.2))),
+    *(cell(scene, BASELINE, value, seed=1) for scene, value in (("a", 20.4), ("b", 22.4))),
 ]
 
 
@@ -75,13 +79,37 @@ def test_a_mean_with_a_gap_is_no_mean() -> None:
 def test_differences_are_paired_by_scene_and_grade() -> None:
     found = paired(CELLS, "full", PSNR)
     assert found is not None
-    # Scene a: +1 and +2, scene b: -0.1 twice.
-    assert found.mean == pytest.approx((1.5 - 0.1) / 2)
-    assert found.lowest == pytest.approx(-0.1)
+    # Scene a: 21 - 20 and 22 - 20.4, scene b: 21.9 - 22 and 21.9 - 22.4: each with the baseline of its own seed.
+    assert found.mean == pytest.approx((1.3 - 0.3) / 2)
+    assert found.lowest == pytest.approx(-0.3)
     assert (found.better, found.scenes) == (1, 2)
-    assert found.seed_spread == pytest.approx(0.5 / 2**0.5)
+    assert found.seed_spread == pytest.approx(abs((1 - 0.1) / 2 - (1.6 - 0.5) / 2) / 2**0.5)
+    assert paired([c for c in CELLS if c.row != BASELINE or c.seed == 0], "full", PSNR) == paired(
+        CELLS[:6], "full", PSNR
+    )
     assert paired(CELLS[:4], "full", PSNR) is None
     assert paired([c for c in CELLS if c.row != BASELINE], "full", PSNR) is None
+
+
+def test_a_component_is_compared_with_the_row_that_lacks_it_unless_it_cannot_show() -> None:
+    cells = [
+        *CELLS,
+        *(replace(c, row="more", numbers=replace(c.numbers, psnr_db=c.numbers.psnr_db + 0.3)) for c in CELLS[4:8]),
+    ]
+    references = {"full": BASELINE, "more": "full", "absent": "full"}
+    lines = components_table(cells, references, {}, [PSNR]).splitlines()
+    assert lines[3] == "| more | full | +0.30 ± 0.00 (worst +0.30; 2/2) |"
+    assert len(lines) == 4
+    mute = components_table(cells, references, {"more": "no power at 30 steps: it touches nothing"}, [PSNR, DEPTH])
+    assert mute.splitlines()[3] == "| more | full | no power at 30 steps: it touches nothing | – |"
+
+
+def test_scene_by_scene() -> None:
+    assert scenes_table(CELLS, ["full"]).splitlines()[2:] == [
+        "| before | 21.10 | 23.10 |",
+        "| baseline | -0.90 | -0.90 |",
+        "| full | +1.30 | -0.30 |",
+    ]
 
 
 def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
@@ -90,14 +118,18 @@ def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
     assert found.mean == pytest.approx(0.0)
     assert found.lowest == pytest.approx(0.01)
     assert found.better == 1
+    smaller = [replace(c, numbers=replace(c.numbers, depth_abs_rel=0.03)) if c.row == "full" else c for c in CELLS]
+    found = paired(smaller, "full", DEPTH)
+    assert found is not None
+    assert (found.better, found.scenes) == (2, 2)
 
 
 def test_the_tables_say_so() -> None:
     text = main_table(CELLS)
     assert "| full | 4 | 21.70 ± 0.35 | 0.000 ± 0.000 | 21.70 ± 0.35 |" in text
-    assert "| captured | 2 | 22.00 | 0.000 | 22.00 |" in text
+    assert "| captured | 4 | 22.10 ± 0.14 | 0.000 ± 0.000 | 22.10 ± 0.14 |" in text
     curve = curve_table(CELLS, ["full"])
-    assert "| mixed_1 | -1.00 | +0.70 (worst -0.10) |" in curve
+    assert "| mixed_1 | -0.90 ± 0.14 (worst -0.90; 0/2) | +0.50 ± 0.07 (worst -0.30; 1/2) |" in curve
 
 
 def test_a_curve_is_relative_to_the_pre_insertion_scene(tmp_path: Path) -> None:
@@ -118,18 +150,18 @@ def test_a_curve_is_relative_to_the_pre_insertion_scene(tmp_path: Path) -> None:
 
 
 def test_the_acceptance_table_counts_and_separates() -> None:
-    def judged(scene: str, psnr: float, depth: float, reasons: tuple[str, ...]) -> CellResult:
+    def judged(scene: str, grade: str, psnr: float, depth: float, reasons: tuple[str, ...]) -> CellResult:
         candidate = Acceptance(
             posed=True, overlap=0.5, depth_conflict=depth, colour_conflict=None, cameras_moved_deg=0.0, reasons=reasons
         )
-        return replace(cell(scene, BASELINE, psnr), candidate=candidate)
+        return replace(cell(scene, BASELINE, psnr, grade=grade), candidate=candidate)
 
     cells = [
         *CELLS[:2],
-        judged("a", 19.0, 0.3, ("depth",)),  # costs 2 dB
-        judged("a", 20.9, 0.1, ()),
-        judged("b", 22.9, 0.2, ()),
-        judged("b", 22.0, 0.15, ()),  # costs 1 dB
+        judged("a", "g", 19.0, 0.3, ("depth",)),  # costs 2 dB
+        judged("a", "h", 20.9, 0.1, ()),
+        judged("b", "g", 22.9, 0.2, ()),
+        judged("b", "h", 22.0, 0.15, ()),  # costs 1 dB
     ]
     text = acceptance_table(cells)
     assert "2 cost more than 0.5 dB" in text
@@ -138,4 +170,8 @@ def test_the_acceptance_table_counts_and_separates() -> None:
     assert "| colour_conflict | 0 | – |" in text
     assert "| refused | 1 of 4 | – |" in text
     assert "| mean loss of the refused, dB | 1 | 2.00 |" in text
+    again = [replace(c, seed=1) for c in cells]
+    assert acceptance_table([*cells, *again]) == text, (
+        "a candidate counts once, however many fits were measured with it"
+    )
     assert acceptance_table(CELLS[:2]).startswith("No candidate")

@@ -12,10 +12,20 @@ from test_epipolar import model_of, noisy, seen_through
 from sceneexpander.frontend.bundle import rotation_exp
 from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
 from sceneexpander.frontend.lens_tests import find_apart_group, pair_costs
+from sceneexpander.frontend.mapping import directions_between_deg
+from sceneexpander.frontend.search import CameraSearch
+from sceneexpander.frontend.sfm_setup import KnownCameras
 from sceneexpander.frontend.sfm_types import SfmConfig
 
 CONFIG = SfmConfig()
-FINE = ViewEvidence(agreeing=0.95, rotation_gap_deg=0.3, direction_sigma_deg=0.4, lens_sigma_deg=0.0)
+FINE = ViewEvidence(
+    agreeing=0.95,
+    rotation_gap_deg=0.3,
+    direction_sigma_deg=0.4,
+    lens_sigma_deg=0.0,
+    rival_angle_deg=0.0,
+    spread_deg=0.0,
+)
 
 
 def flat(world: worlds.PointWorld) -> worlds.PointWorld:
@@ -64,6 +74,22 @@ def test_a_focal_of_its_own_needs_depth_to_be_believed(relief: bool, refused: bo
     assert not hinted.refusal(CONFIG), "what its file says is not left to the pictures"
 
 
+@pytest.mark.parametrize(("relief", "open_to_another"), [(1.0, False), (0.2, False), (0.004, True)])
+def test_two_photos_of_something_flat_allow_another_place(relief: float, open_to_another: bool) -> None:
+    """A plane seen twice has two explanations; which of them is right only relief tells."""
+    full = worlds.point_world(53, points=250)
+    wall = full.points.copy()
+    wall[:, 2] = 5 + 0.6 * wall[:, 0] + (wall[:, 2] - 5) * relief
+    world = replace(full, points=wall)
+    world = noisy(replace(world, pixel_xy=worlds.project(world)))
+    mapping, features, pairs = model_of(full)
+    mapping.tracks, mapping.points = world.tracks, world.points
+    mapping.registered[:] = np.arange(5) < 2
+    features = [replace(own, pixel_xy=world.pixel_xy[:, view]) for view, own in enumerate(features)]
+    found = weigh_evidence(mapping, features, pairs, [False] * 5)[1]
+    assert ("flat" in replace(found, direction_sigma_deg=0.0).doubt(CONFIG)) == open_to_another, found
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -77,7 +103,7 @@ def test_each_kind_of_evidence_can_fail(change: dict[str, float], said: str) -> 
 
 
 def test_doubts_are_no_refusals() -> None:
-    for change in ({"agreeing": 0.6}, {"direction_sigma_deg": 20.0}):
+    for change in ({"agreeing": 0.6}, {"direction_sigma_deg": 20.0}, {"rival_angle_deg": 20.0}, {"spread_deg": 20.0}):
         found = replace(FINE, **change)
         assert found.doubt(CONFIG)
         assert not found.refusal(CONFIG)
@@ -93,3 +119,55 @@ def test_two_lenses_taken_for_one_fall_apart_and_one_lens_does_not() -> None:
     two = seen_through(seen_through(world, 1, zoom=0.5), 3, zoom=0.5)
     mapping, features, pairs = model_of(noisy(two))
     assert sorted(find_apart_group(mapping, pair_costs(mapping, features, pairs))) == [1, 3]
+
+
+def test_matches_behind_a_camera_do_not_agree_with_it() -> None:
+    """The epipolar lines of a camera and of one on the other side of its neighbours are the same."""
+    mapping, features, pairs = model_of(noisy(worlds.point_world(54, points=250)))
+    right = weigh_evidence(mapping, features, pairs, [False] * 5)
+    assert min(found.agreeing for found in right.values()) > 0.95
+    centres = mapping.centres
+    mapping.registered[:] = np.arange(5) < 2
+    mapping.translations[1] = -mapping.rotations[1] @ (2 * centres[0] - centres[1])
+    assert weigh_evidence(mapping, features, pairs, [False] * 5)[1].agreeing < 0.05
+
+
+def test_directions_between_two_models_are_angles_at_the_views() -> None:
+    mapping, _, _ = model_of(noisy(worlds.point_world(55, points=250)))
+    mapping.registered[:] = np.arange(5) < 2
+    other = mapping.copy()
+    turned = rotation_exp(np.array([0.0, 0.0, np.deg2rad(30.0)]))
+    mapping.rotations[:2], mapping.translations[0] = np.eye(3), 0.0
+    other.rotations[:2], other.translations[0] = np.eye(3), 0.0
+    mapping.translations[1], other.translations[1] = [1.0, 0.0, 0.0], turned @ [2.0, 0.0, 0.0]
+    np.testing.assert_allclose(directions_between_deg(mapping, [other])[:2], 30.0)
+    assert not directions_between_deg(mapping, [mapping]).any()
+
+
+def test_a_long_lens_that_got_stuck_is_moved_on_and_says_what_else_fits() -> None:
+    """A far cloud of little depth, and cameras settled at a focal 40 % off."""
+    near = worlds.point_world(56, points=300, focal=2600.0)
+    far = np.array([0.0, 0.0, 12.0])
+    points = near.points * [1.0, 1.0, 0.5] + far
+    translations = near.translations - np.einsum("vij,j->vi", near.rotations, far) + far
+    world = replace(near, points=points, translations=translations)
+    world = noisy(replace(world, pixel_xy=worlds.project(world)))
+    model, features, pairs = model_of(world)
+    right = model.copy()
+    model.move_main_focal(-0.5)
+    model.finish(refine_focal=False)
+    known = KnownCameras(cam_from_world=np.tile(np.eye(4), (5, 1, 1)), posed=np.zeros(5, bool), intrinsics=None)
+    search = CameraSearch(
+        features=features,
+        pairs=pairs,
+        found=None,  # type: ignore[arg-type]
+        known=known,
+        plan=None,  # type: ignore[arg-type]
+        config=CONFIG,
+        setup=None,  # type: ignore[arg-type]
+    )
+    moved = search._with_focal_elsewhere(model)
+    assert abs(model.log_focal[0] - right.log_focal[0]) > 0.3
+    assert moved.score() > model.score()
+    np.testing.assert_allclose(moved.log_focal[0], right.log_focal[0], atol=0.01)
+    assert 0 < moved.spread_deg.max() < CONFIG.max_spread_deg

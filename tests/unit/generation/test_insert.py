@@ -147,7 +147,7 @@ def test_refusals(folder: Path, tmp_path: Path) -> None:
     assert "round 3" in refusal(folder, 3)
     assert "has no recorded picture" in refusal(folder, 3)
     assert "round 4 was asked for" in refusal(folder, 4)
-    for settings in ({"candidate": -1}, {"count": 0}, {"fit": "squash"}):
+    for settings in ({"candidate": -1}, {"fit": "squash"}):
         with pytest.raises(UserError, match=rf"^(generator\.)?{next(iter(settings))}: "):
             GeneratorConfig(**settings)  # type: ignore[arg-type]
 

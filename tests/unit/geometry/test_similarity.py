@@ -99,3 +99,17 @@ def test_inverse_undoes() -> None:
     assert_close(truth.inverse().poses(truth.poses(poses)), poses, atol=1e-12, rtol=0)
     points = poses[:, :3, 3]
     assert_close(truth.inverse().points(truth.points(points)), points, atol=1e-12, rtol=0)
+
+
+def test_enlarging_multiplies_the_target_frame() -> None:
+    truth, points = random_similarity(10), random_poses(4, 11)[:, :3, 3]
+    assert_close(truth.enlarged(0.4).points(points), 0.4 * truth.points(points), atol=1e-12, rtol=0)
+
+
+def test_align_poses_finds_a_scale_below_one_and_refuses_one_below_nothing() -> None:
+    truth, poses = random_similarity(12, scale=0.3), random_poses(4, 13)
+    assert_same(align_poses(poses, truth.poses(poses)), truth)
+    mirrored = poses.clone()
+    mirrored[:, :3, 3] *= -1  # the same orientations, every centre on the other side
+    with pytest.raises(ValueError, match="positive scale"):
+        align_poses(poses, mirrored)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sceneexpander.geometry.rigid import look_at, quat_wxyz_from_rotation, rotation_angle_deg, rotation_from_quat_wxyz
-from sceneexpander.geometry.trajectory import navigation, orbit, shortest_path_order, spiral
+from sceneexpander.geometry.trajectory import focus_depth, mean_up, navigation, orbit, shortest_path_order, spiral
 
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 
@@ -198,3 +198,29 @@ def test_spiral_starts_and_ends_at_its_camera_and_keeps_the_focus() -> None:
     torch.testing.assert_close(path[:, :3, 2], sight)
     distance = (path[:, :3, 3] - pose[:3, 3]).norm(dim=-1)
     assert 0.25 < distance.max() < 0.36
+
+
+def test_up_is_the_mean_of_the_cameras_and_the_first_ones_where_they_cancel() -> None:
+    poses, _ = random_cameras(5)
+    up = mean_up(poses)
+    assert float(up.norm()) == pytest.approx(1)
+    mean = -poses[:, :3, 1].mean(0)
+    torch.testing.assert_close(up, mean / mean.norm())
+    turned = poses[:1].clone()
+    turned[:, :3, :2] *= -1  # upside down
+    against = torch.cat([poses[:1], turned])
+    torch.testing.assert_close(mean_up(against), -poses[0, :3, 1])
+    nearly = torch.cat([poses[:1].expand(11, 4, 4), turned.expand(9, 4, 4)])  # what is left has a tenth of the length
+    torch.testing.assert_close(mean_up(nearly.flip(0)), poses[0, :3, 1], msg="the first one decides")
+
+
+def test_one_turns_around_the_median_of_the_middle() -> None:
+    """Whatever is at the border, on any side, does not matter; in the middle the median does, for each view alone."""
+    depth = torch.full((2, 16, 24), 100.0)
+    depth[0, 4:12, 6:18] = 3.0
+    depth[1, 4:12, 6:18] = torch.arange(96.0).reshape(8, 12) + 1
+    assert focus_depth(depth).tolist() == [3.0, 48.0]
+    for rows, columns in ((slice(0, 4), slice(None)), (slice(12, 16), slice(None)), (slice(None), slice(0, 6))):
+        other = depth.clone()
+        other[:, rows, columns] = 0.5
+        assert torch.equal(focus_depth(other), focus_depth(depth))

@@ -43,6 +43,7 @@ from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.mini.training.scores import scene_samples
 from sceneexpander.models.mini.training.trainer import LossWeights, TrainConfig, Trainer
 from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor
+from sceneexpander.models.registry import build_reconstructor
 from sceneexpander.synthetic.views import make_views
 
 TINY = MiniConfig(
@@ -583,3 +584,21 @@ def test_broken_samples_and_folders_are_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"00000001.*no folder for samples"):
         samples_folder(broken)
     assert samples_folder(tmp_path / "new" / "one").is_dir()
+
+
+def test_free_cameras_give_the_camera_heads_answer_its_full_weight() -> None:
+    plain, free = (build_reconstructor("mini", variant=v, weights="builtin").model for v in ("default", "free_cameras"))
+    assert isinstance(plain, Mini)
+    assert isinstance(free, Mini)
+    assert free.config == replace(plain.config, camera_gain=1.0)
+    assert plain.config.camera_gain < 0.1
+    images, priors = scene(3, 56, 84)
+    for model in (plain, free):
+        with torch.no_grad():
+            head = model.network.camera_head.get_submodule(model.network.camera_head.names.predictor)
+            head.get_submodule("fc2").bias[:3].add_(0.01)
+    moved = [
+        float((model.predict(images, priors).world_from_cam[1:] - priors.world_from_cam[1:]).abs().max().detach())
+        for model in (plain, free)
+    ]
+    assert moved[1] > 10 * moved[0] > 0

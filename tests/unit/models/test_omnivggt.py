@@ -330,3 +330,20 @@ def test_nearest_resize_aligns_corners() -> None:
     row = np.arange(4, dtype=np.float32)[None]
     assert resize_nearest(row, 1, 6).tolist() == [[0.0, 0.0, 1.0, 2.0, 2.0, 3.0]]
     assert resize_nearest(row, 2, 2).tolist() == [[0.0, 2.0]] * 2
+
+
+def test_nearest_resize_takes_the_pixels_that_the_official_loader_takes() -> None:
+    """The rule in integers and IEEE doubles: the factor is rounded, then its inverse, then the product with the index."""
+    sizes = [*range(14, 600, 9), 194, 202, 518, 1008]
+    for target in (14, 70, 98, 392, 518):
+        for size in sizes:
+            expected = [min(int(index * (1.0 / (target / size))), size - 1) for index in range(target)]
+            ramp = np.arange(size, dtype=np.float32)
+            assert resize_nearest(ramp[None], 1, target)[0].tolist() == expected, (size, target)
+            assert resize_nearest(ramp[:, None], target, 1)[:, 0].tolist() == expected, (size, target)
+
+
+def test_nearest_resize_keeps_the_rounding_of_the_official_loader() -> None:
+    ramp = np.arange(202, dtype=np.float32)[None]
+    # 49 * 202 / 98 is 101 exactly; by way of the rounded factor it is a little less.
+    assert resize_nearest(ramp, 1, 98)[0, 49] == 100.0

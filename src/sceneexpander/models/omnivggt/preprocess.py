@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -123,10 +124,11 @@ def usable_depth(depth: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def resize_nearest(depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
-    """Nearest-neighbour resize whose source index is ``floor(index / factor)``: corners align, not pixel centres."""
-    rows = np.floor(np.arange(height) / (height / depth.shape[0])).astype(np.int64)
-    columns = np.floor(np.arange(width) / (width / depth.shape[1])).astype(np.int64)
-    return depth[rows.clip(max=depth.shape[0] - 1)[:, None], columns.clip(max=depth.shape[1] - 1)]
+    """Nearest-neighbour resize by OpenCV's rule: the source index is ``floor(index / factor)``, so corners align, not pixel centres.
+
+    OpenCV itself, because its rounding of the factor decides single columns where the sizes do not divide.
+    """
+    return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
 def read_camera(path: Path, image_size: tuple[int, int]) -> ViewCamera:

@@ -1,0 +1,124 @@
+"""What `docs/ablation.md` holds: which rows are measured where. One command measures all of it (``python -m sceneexpander.ablation``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sceneexpander.expandbench.run import BASELINE
+from sceneexpander.expandbench.scenes import DEVELOPMENT, TEST
+
+TABLE = ("anchor", "subset_aug", "self_distill", "self_distill_p1", "full")  # the paper's, after the baseline
+BEYOND = (
+    "no_realign",
+    "no_tone",
+    "no_trust",
+    "no_close_gaps",
+    "corrected",
+    "none",
+)  # "none": nothing left out of the default
+CONTROLS = ("control_no_insertion", "control_no_anchor")
+
+# What every row is compared with to see one component's own effect; rows that are not named: with the default.
+REFERENCES = {
+    "anchor": BASELINE,
+    "subset_aug": "anchor",
+    "self_distill": "subset_aug",
+    "self_distill_p1": "self_distill",
+    "full": "self_distill",
+    "control_no_insertion": "full",
+    "control_no_anchor": "full",
+    "corrected": BASELINE,
+    "none": "corrected",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Study:
+    """One set of cells: every row on every scene and grade with every seed.
+
+    Attributes:
+        name: for the command line and in the results file.
+        title: its heading.
+        meaning: what it is for, in a sentence or two.
+        overrides: of the configuration, for all rows.
+        experiment: the option of ``conf/experiment``.
+    """
+
+    name: str
+    title: str
+    meaning: str
+    scenes: tuple[str, ...]
+    grades: tuple[str, ...]
+    rows: tuple[str, ...]
+    seeds: tuple[int, ...]
+    overrides: tuple[str, ...] = ()
+    experiment: str = "expandbench"
+
+
+STUDIES = (
+    Study(
+        name="rows",
+        title="The rows, as users get them",
+        meaning="All rows, Gaussians fitted to their pictures.",
+        scenes=DEVELOPMENT,
+        grades=("mixed_2",),
+        rows=(*TABLE, *BEYOND, *CONTROLS),
+        seeds=(0, 1, 2),
+    ),
+    Study(
+        name="predicted",
+        title="The rows, as the network makes them",
+        meaning="Without the fit, as in the paper, whose methods are feed-forward.",
+        scenes=DEVELOPMENT,
+        grades=("mixed_2",),
+        rows=(*TABLE, "corrected", "none"),
+        seeds=(0, 1, 2),
+        overrides=("refine.visits=0",),
+    ),
+    Study(
+        name="grades",
+        title="Against misalignment",
+        meaning="The default and the corrections alone, from a faultless inserted picture to a bad one; with the fit.",
+        scenes=DEVELOPMENT,
+        grades=(
+            "clean",
+            "mixed_2",
+            "mixed_4",
+            "exposure_6",
+            "rotation_5",
+            "rotation_10",
+            "translation_5",
+            "translation_10",
+        ),
+        rows=("corrected", "none"),
+        seeds=(0,),
+    ),
+    Study(
+        name="long",
+        title="Rows that need many steps",
+        meaning="The paper's 400 steps for rows that cannot differ in 30; three scenes.",
+        scenes=("room_2", "corridor_2", "courtyard_1"),
+        grades=("mixed_2",),
+        rows=(
+            "self_distill",
+            "full",
+            "corrected",
+            "none",
+            "ema_momentum_099",
+            "restore_interval_1",
+            "restore_interval_100",
+            "plateau",
+        ),
+        seeds=(0,),
+        experiment="expandbench_long",
+    ),
+    Study(
+        name="test",
+        title="Test scenes",
+        meaning="Scenes that nothing was chosen on, measured once for this version; with the fit.",
+        scenes=TEST,
+        grades=("clean", "mixed_2"),
+        rows=("full", "corrected", "none"),
+        seeds=(0, 1, 2),
+    ),
+)
