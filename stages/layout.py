@@ -15,6 +15,7 @@ PAGE_CONFIG = "config.yaml"  # in a scene's folder of PAGES: its composed config
 PAGE_GAUSSIANS = "gaussians.json"  # there as well: hashes of the Gaussians' files, which are too large to be gathered
 REPORT = OUTPUTS / "report"
 CODE = OUTPUTS / "code.json"
+GIVEN = OUTPUTS / "given"  # links to files that the configuration names, by scene
 ENVIRONMENT = OUTPUTS / "environment.json"  # that the hashes in CODE belong to
 REPEATS = "repeat_*"
 REFINEMENT = "refinement.json"  # beside a reconstruction whose Gaussians were refined: what it changed
@@ -40,7 +41,7 @@ def given(scene: str, kind: str) -> Path:
 
     ``kind``: ``picture`` (a link per round), ``model`` (weights), or a rival's name (weights).
     """
-    return OUTPUTS / "given" / scene / kind
+    return GIVEN / scene / kind
 
 
 def prepared(scene: str) -> Path:

@@ -153,7 +153,9 @@ def test_a_pipe_does_not_hold_it_up(tmp_path: Path) -> None:
 
 
 def test_names_of_the_pipelines_own_results_are_those_of_the_layout() -> None:
-    assert {path.name for path in (layout.PAGES, layout.REPORT, layout.CODE)} == RESERVED
+    assert {
+        path.name for path in (layout.PAGES, layout.REPORT, layout.CODE, layout.ENVIRONMENT, layout.GIVEN)
+    } == RESERVED
     outs = {
         place.split("/")[1]
         for stage in yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"].values()

@@ -432,6 +432,13 @@ STEPS = (
         title="Normals of captured views",
         better="lower",
     ),
+    Quantity(
+        name="anchor_gaussian",
+        metric="anchor_gaussian",
+        group=Group.LOSS,
+        title="Gaussians of captured views",
+        better="lower",
+    ),
     Quantity(name="gen_camera", metric="inserted_camera", group=Group.LOSS, title="Inserted camera", better="lower"),
     Quantity(name="gen_depth", metric="inserted_depth", group=Group.LOSS, title="Inserted depth", better="lower"),
     Quantity(name="gen_normal", metric="inserted_normal", group=Group.LOSS, title="Inserted normals", better="lower"),

@@ -142,8 +142,6 @@ class CameraSearch:
         several = min(int(model.registered.sum()), self.found.distinct) >= self.config.min_views_for_focal
         attempted = self.plan.refine and (several or self._hinted(start))
         refine = self._finish(model, attempted)
-        if refine:
-            model = self._with_focal_elsewhere(model)
         for _ in range(self.config.lens_rounds if refine else 0):
             freer = model.copy()
             if not settle_lenses(freer, self.features, self.pairs):
@@ -156,6 +154,8 @@ class CameraSearch:
             model, refine = freer, refined
         if refine and snap_lenses(model):
             refine = self._finish(model, refine)
+        if refine:  # only now: a view with another lens than it seems to have leaves the focal of all uncertain
+            model = self._with_focal_elsewhere(model)
         return model, start, refine, attempted
 
     def _with_focal_elsewhere(self, model: Mapping) -> Mapping:

@@ -24,13 +24,14 @@ from sceneexpander.expansion import (
     captured_prediction,
     initial_state,
     joint_reconstruction,
-    rounds,
 )
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig
 from sceneexpander.generation import GeneratorConfig, generate_inserted_view
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.ingest import IngestConfig, load_scene
+from sceneexpander.reconstruction import views
+from sceneexpander.reconstruction.optics import known_of
 from tests.support.tiny_model import TinyReconstructor
 
 COURTYARD = Path(__file__).parents[3] / "scenes" / "courtyard"
@@ -94,13 +95,13 @@ def test_focal_lengths_of_files_are_told_in_both_estimates(tmp_path: Path, monke
         told.append(given["optics"])
         raise Seen
 
-    monkeypatch.setattr(rounds, "build_priors", front_end)
+    monkeypatch.setattr(views, "build_priors", front_end)
     with pytest.raises(Seen):
         initial_state(scene, loaded, FRONT_END, WarmupConfig(steps=0), seed=0)
     monkeypatch.undo()
     without = replace(loaded, priors=PriorsUse.AUTO)  # what the state is made of does not matter here
     state, *_ = initial_state(scene, without, FRONT_END, WarmupConfig(steps=0), seed=0)
-    monkeypatch.setattr(rounds, "build_priors", front_end)
+    monkeypatch.setattr(views, "build_priors", front_end)
     with pytest.raises(Seen):
         joint_reconstruction(state, inserted, loaded, FRONT_END, seed=0)
     alone, joint = told
@@ -147,8 +148,8 @@ def test_known_cameras_hold_in_both_estimates_and_in_later_rounds(tmp_path: Path
 def test_a_view_that_came_later_has_no_known_pose_and_the_photos_focal(tmp_path: Path) -> None:
     scene, inserted = read(scene_folder(tmp_path / "s"))
     known = known_cameras(scene)
-    assert rounds.known_of(scene.views, None) is None
-    told = rounds.known_of(scene.views.append(inserted.view), known)
+    assert known_of(scene.views, None) is None
+    told = known_of(scene.views.append(inserted.view), known)
     assert told is not None
     assert told.world_from_cam is not None
     assert told.intrinsics_px is not None

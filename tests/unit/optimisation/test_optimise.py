@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -215,10 +215,11 @@ def test_the_key_of_resume_points_covers_every_tensor() -> None:
 
     variants = [start, *(replace(start, **other) for other in others(start))]
     variants += [replace(start, gaussians=replace(start.gaussians, **other)) for other in others(start.gaussians)]
-    keys = {_run_key(variant, VIEWS.images, None, OptimiseConfig(), 0) for variant in variants}
-    keys |= {_run_key(start, VIEWS.images / 2, None, OptimiseConfig(), 0)}
-    keys |= {_run_key(start, VIEWS.images, start.depth > 0, OptimiseConfig(), 0)}
-    keys |= {_run_key(start, VIEWS.images, None, OptimiseConfig(steps=7), 0)}
-    keys |= {_run_key(start, VIEWS.images, None, OptimiseConfig(), 1)}
-    assert len(keys) == len(variants) + 4
-    assert _run_key(spoiled(), VIEWS.images.clone(), None, OptimiseConfig(), 0) in keys
+    keys = {_run_key(variant, VIEWS.images, None, None, OptimiseConfig(), 0) for variant in variants}
+    keys |= {_run_key(start, VIEWS.images / 2, None, None, OptimiseConfig(), 0)}
+    keys |= {_run_key(start, VIEWS.images, None, start.depth > 0, OptimiseConfig(), 0)}
+    keys |= {_run_key(start, VIEWS.images, [*VIEWS.images], None, OptimiseConfig(), 0)}
+    keys |= {_run_key(start, VIEWS.images, None, None, OptimiseConfig(steps=7), 0)}
+    keys |= {_run_key(start, VIEWS.images, None, None, OptimiseConfig(), 1)}
+    assert len(keys) == len(variants) + 5
+    assert _run_key(spoiled(), VIEWS.images.clone(), None, None, OptimiseConfig(), 0) in keys
