@@ -358,7 +358,7 @@ class _NormalEquations:
         if self._coupling is None:
             return hessian, -self._gradient, None
         blocks = _PointBlocks.factor(self._point_hessian, damping)
-        half = blocks.solve_half(self._coupling).reshape(self._size, -1)
+        half = blocks.solve_half(self._coupling).reshape(self._size, self._point_gradient.size)
         matrix = hessian - half @ half.T
         return matrix, -self._gradient + half @ blocks.solve_half(self._point_gradient).reshape(-1), blocks
 
@@ -374,7 +374,7 @@ class _NormalEquations:
             translations[camera] = translations[camera] + move[3:]
         points = problem.points
         if self._coupling is not None and blocks is not None:
-            pull = -self._point_gradient - (delta @ self._coupling.reshape(self._size, -1)).reshape(3, -1)
+            pull = -self._point_gradient - np.tensordot(delta, self._coupling, 1)
             points = points + blocks.solve(pull).T
         lenses = problem.lenses
         if len(self._free_lens):

@@ -238,3 +238,12 @@ def test_rotation_exp_is_a_rotation_and_accurate_near_zero() -> None:
         assert np.linalg.det(rotation) == pytest.approx(1.0)
     half_turn = rotation_exp(np.array([0.0, 0.0, np.pi / 2]))
     np.testing.assert_allclose(half_turn @ np.array([1.0, 0, 0]), [0, 1, 0], atol=1e-12)
+
+
+def test_points_move_to_their_rays_where_all_cameras_are_held() -> None:
+    world = worlds.point_world(2)
+    problem = worlds.bundle_problem(world, camera_free=np.zeros(len(world.rotations), bool))
+    start = replace(problem, points=problem.points + 0.05)
+    result = adjust(start)
+    np.testing.assert_allclose(result.problem.points, world.points, atol=1e-6)
+    np.testing.assert_array_equal(result.problem.rotations, world.rotations)
