@@ -24,7 +24,8 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import camera_vector_from_pose
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.rigid import look_at
-from sceneexpander.rendering import RenderConfig, produce_renders
+from sceneexpander.rendering.config import RenderConfig
+from sceneexpander.rendering.produce import produce_renders
 from sceneexpander.splatting.ply import read_ply, write_ply
 from sceneexpander.splatting.spz import read_spz, write_spz
 

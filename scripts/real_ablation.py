@@ -20,7 +20,8 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import entry_point
-from sceneexpander.evaluation import EvaluateConfig, evaluate
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.expansion import (
     RoundInputs,
     adapt_round,

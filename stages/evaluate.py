@@ -4,20 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.metrics import Fit, UnavailableRow
-from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.store import read_json
 from sceneexpander.artifacts.unavailable import unavailable_in
-from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.config.files import read_sections
 from sceneexpander.evaluation.config import EvaluateConfig
-from sceneexpander.evaluation.evaluate import Navigation, evaluate
-from sceneexpander.evaluation.repeats import over_repeats
-from sceneexpander.evaluation.truth import load_truth
 from stages import layout
-from stages.machine import use_machine
 from stages.runner import Cell, stage
 
 
@@ -34,7 +26,6 @@ class Sections:
 def main(cell: Cell) -> None:
     """Measure on the views of all rounds so far, on the tour, and against known truth where the scene has it."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_machine(sections.threads)
     made = layout.reconstruction(cell.scene, cell.round, cell.method)
     lacking = unavailable_in(made)
     if lacking is not None:
@@ -47,6 +38,17 @@ def main(cell: Cell) -> None:
             reason=lacking.reason,
         ).save(layout.metrics(cell.scene, cell.round, cell.method))
         return
+    # Only now: torch takes seconds to import.
+    from sceneexpander.artifacts.inserted import InsertedView
+    from sceneexpander.artifacts.reconstruction import Reconstruction
+    from sceneexpander.artifacts.renders import Renders
+    from sceneexpander.artifacts.views import ViewSet
+    from sceneexpander.evaluation.evaluate import Navigation, evaluate
+    from sceneexpander.evaluation.repeats import over_repeats
+    from sceneexpander.evaluation.truth import load_truth
+    from stages.machine import use_machine
+
+    use_machine(sections.threads)
     before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
     views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
     renders = Renders.load(layout.renders(cell.scene, cell.round, cell.method))

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.unavailable import passed_on
 from sceneexpander.config.files import read_sections
-from sceneexpander.viewer.packed import pack_splats
 from stages import layout
-from stages.machine import use_machine
 from stages.runner import Cell, stage
 
 
@@ -25,11 +22,16 @@ class Sections:
 @stage("scene", "round", "method")
 def main(cell: Cell) -> None:
     """Weigh by what the method's own cameras see, keep the heaviest, quantise."""
-    sections = read_sections(layout.config(cell.scene), Sections)
-    use_machine(sections.threads)
     made = layout.reconstruction(cell.scene, cell.round, cell.method)
     if passed_on(made, layout.packed(cell.scene, cell.round, cell.method)):
         return
+    # Only now: torch takes seconds to import.
+    from sceneexpander.artifacts.reconstruction import Reconstruction
+    from sceneexpander.viewer.packed import pack_splats
+    from stages.machine import use_machine
+
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_machine(sections.threads)
     reconstruction = Reconstruction.load(made)
     with directory_being_written(layout.packed(cell.scene, cell.round, cell.method)) as folder:
         pack_splats(reconstruction, device=sections.device).save(folder)

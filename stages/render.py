@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.unavailable import passed_on
 from sceneexpander.config.files import read_sections
 from sceneexpander.progress import progress_bar
-from sceneexpander.rendering import RenderConfig, produce_renders
+from sceneexpander.rendering.config import RenderConfig
 from stages import layout
-from stages.machine import use_machine
 from stages.runner import Cell, stage
 
 
@@ -27,11 +25,16 @@ class Sections:
 @stage("scene", "round", "method")
 def main(cell: Cell) -> None:
     """Render videos, stills, every view, and the Gaussians as PLY."""
-    sections = read_sections(layout.config(cell.scene), Sections)
-    use_machine(sections.threads)
     made = layout.reconstruction(cell.scene, cell.round, cell.method)
     if passed_on(made, layout.renders(cell.scene, cell.round, cell.method)):
         return
+    # Only now: torch takes seconds to import.
+    from sceneexpander.artifacts.reconstruction import Reconstruction
+    from sceneexpander.rendering.produce import produce_renders
+    from stages.machine import use_machine
+
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_machine(sections.threads)
     reconstruction = Reconstruction.load(made)
     # The method before the insertion has no inserted camera of its own: it takes the unadapted backbone's.
     reference = Reconstruction.load(layout.reconstruction(cell.scene, cell.round, "backbone"))

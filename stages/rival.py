@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_sections
-from sceneexpander.inference.config import RivalsConfig
+from sceneexpander.inference.config import NEEDS_CHECKPOINT, RivalsConfig
 from sceneexpander.optimisation.config import RefineConfig
 from stages import layout
 from stages.runner import Cell, left_out, stage
@@ -28,7 +29,14 @@ def main(cell: Cell) -> None:
     """Reconstruct all views with the rival's own weights and fit its Gaussians to them, or write down why it cannot be."""
     if left_out(cell):
         return
-    # Only now: most runs ask for no rival, and torch takes seconds to import.
+    sections = read_sections(layout.config(cell.scene), Sections)
+    config = sections.rivals.of(cell.method)
+    target = layout.reconstruction(cell.scene, cell.round, cell.method).parent
+    if config.weights is None:
+        with directory_being_written(target) as folder:
+            Unavailable(method=cell.method, model=cell.method, reason=NEEDS_CHECKPOINT).save(folder / "reconstruction")
+        return
+    # Only now: most runs have no rival's weights, and torch takes seconds to import.
     from sceneexpander.artifacts.inserted import InsertedView
     from sceneexpander.artifacts.reconstruction import Reconstruction
     from sceneexpander.artifacts.state import load_priors
@@ -38,16 +46,15 @@ def main(cell: Cell) -> None:
     from sceneexpander.reconstruction.fitting import fitted
     from stages.machine import use_machine
 
-    sections = read_sections(layout.config(cell.scene), Sections)
     use_machine(sections.threads)
     before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
     views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
     priors = load_priors(layout.joint_priors(cell.scene, cell.round))
-    made = reconstruct_rival(cell.method, sections.rivals.of(cell.method), views, priors, device=sections.device)
+    made = reconstruct_rival(cell.method, config, views, priors, device=sections.device)
     fit = None
     if isinstance(made, Reconstruction):
         made, fit = fitted(made, views, sections.refine, seed=sections.seed, device=sections.device)
-    with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
+    with directory_being_written(target) as folder:
         made.save(folder / "reconstruction")
         if isinstance(made, Reconstruction):
             write_json_atomic(folder / "report.json", {"licence": licence_of(cell.method)})

@@ -11,8 +11,8 @@ from sceneexpander.config.compose import compose, scene_option
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
-from sceneexpander.evaluation import check_truth
 from sceneexpander.evaluation.image import WINDOW
+from sceneexpander.evaluation.truth import check_truth
 from sceneexpander.generation import generate_inserted_view
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene

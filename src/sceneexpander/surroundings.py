@@ -22,7 +22,7 @@ from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV
 from sceneexpander.tracking.store import without_foreign_settings
 
 _LEFT_OUT = ("HYDRA_", "DVC_", "PYTHON", "GIT_")
-_KEPT = frozenset({"PYTHONHASHSEED", "PYTHONDONTWRITEBYTECODE", "PYTHONUNBUFFERED", "PYTHONPYCACHEPREFIX"})
+_KEPT = frozenset({"PYTHONHASHSEED", "PYTHONUNBUFFERED", "PYTHONPYCACHEPREFIX"})
 LOCAL_CONFIG = Path(".dvc") / "config.local"
 
 
@@ -48,6 +48,9 @@ def pipeline_environment(folder: Path, project: Path, *, error_file: Path | None
         "DVC_NO_ANALYTICS": "true",
         "MLFLOW_DISABLE_TELEMETRY": "true",
     }
+    if os.environ.get("PYTHONDONTWRITEBYTECODE"):
+        # Nothing is wanted beside the sources. But a run starts some forty interpreters, and to compile torch costs each of them seconds.
+        environment.setdefault("PYTHONPYCACHEPREFIX", str(project / ".cache" / "bytecode"))
     environment.pop(ERROR_FILE_ENV, None)
     if error_file is not None:
         environment[ERROR_FILE_ENV] = str(error_file)

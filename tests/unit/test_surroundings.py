@@ -151,6 +151,16 @@ def test_what_names_the_machine_stays(name: str, tmp_path: Path, monkeypatch: py
     assert workspace_environment(tmp_path, tmp_path)[name] == KEPT[name]
 
 
+def test_no_stage_compiles_again_what_another_has_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.delenv("PYTHONPYCACHEPREFIX", raising=False)
+    (tmp_path / "module.py").write_text("")
+    environment = workspace_environment(tmp_path, tmp_path)
+    subprocess.run([sys.executable, "-c", "import module"], cwd=tmp_path, env=environment, check=True)
+    assert list((tmp_path / ".cache").rglob("module.*.pyc"))
+    assert not (tmp_path / "__pycache__").exists()
+
+
 def test_commands_run_by_a_shell_that_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SHELL", "/bin/false")
     assert workspace_environment(tmp_path, tmp_path)["SHELL"] == "/bin/sh"

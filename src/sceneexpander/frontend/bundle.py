@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 _MIN_DEPTH = 1e-4  # points nearer than this (or behind) are projected at this depth: a huge error, never an overflow
 _STOP_DECREASE = 1e-6  # relative decrease of the cost below which iteration ends
 _MAX_DAMPING = 1e10
+_LEAST_PIVOT = 1e-15  # of a point's block, relative to its diagonal
 _GAUGE_DAMPING = 1e-7  # keeps the scale, which nothing observes, from drowning everything else
 
 # Columns of a lens's parameters.
@@ -102,92 +103,98 @@ class BundleResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Linearisation:
-    """Residuals and their derivatives, per observation."""
+    """Residuals and their derivatives. Observations come last: what is done to all of them then runs along memory."""
 
-    residual: Float[np.ndarray, "observation 2"]
-    camera: Float[np.ndarray, "observation 2 6"]  # d residual / d (w, t)
-    point: Float[np.ndarray, "observation 2 3"]
-    lens: Float[np.ndarray, "observation 2 5"]  # d residual / d parameters of the camera's lens
+    residual: Float[np.ndarray, "2 observation"]
+    camera: Float[np.ndarray, "2 6 observation"]  # d residual / d (w, t)
+    point: Float[np.ndarray, "2 3 observation"]
+    lens: Float[np.ndarray, "2 5 observation"]  # d residual / d parameters of the camera's lens
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Projection:
     """Points in their cameras and where they fall, with what the derivatives need."""
 
-    rotated: Float[np.ndarray, "observation 3"]  # R X
+    rotation: Float[np.ndarray, "3 3 observation"]  # of the camera
+    rotated: Float[np.ndarray, "3 observation"]  # R X
     depth: Float[np.ndarray, " observation"]
     in_front: Bool[np.ndarray, " observation"]
-    plane_xy: Float[np.ndarray, "observation 2"]  # x / z before distortion
+    plane_xy: Float[np.ndarray, "2 observation"]  # x / z before distortion
     radius2: Float[np.ndarray, " observation"]
+    k1: Float[np.ndarray, " observation"]
+    k2: Float[np.ndarray, " observation"]
     gain: Float[np.ndarray, " observation"]  # 1 + k1 r^2 + k2 r^4
-    focal_px: Float[np.ndarray, "observation 2"]
-    residual: Float[np.ndarray, "observation 2"]
+    focal_px: Float[np.ndarray, "2 observation"]
+    residual: Float[np.ndarray, "2 observation"]
 
 
 def _project(problem: BundleProblem) -> _Projection:
     camera = problem.camera_index
-    rotated = np.einsum("oij,oj->oi", problem.rotations[camera], problem.points[problem.point_index])
-    in_camera = rotated + problem.translations[camera]
+    rotation = _per_observation(problem.rotations, camera)
+    x, y, z = _per_observation(problem.points, problem.point_index)
+    rotated = rotation[:, 0] * x + rotation[:, 1] * y + rotation[:, 2] * z
+    in_camera = rotated + _per_observation(problem.translations, camera)
     lens = problem.lenses.resolved[problem.lens_index]  # (camera, 5)
-    focal = (problem.focals_px * np.exp(lens[:, LOG_FOCAL, None]))[camera]
-    centre = (problem.centres_px + problem.shift_unit_px * lens[:, SHIFT_X : SHIFT_Y + 1])[camera]
-    depth = np.maximum(in_camera[:, 2], _MIN_DEPTH)
-    plane_xy = in_camera[:, :2] / depth[:, None]
-    radius2 = (plane_xy**2).sum(1)
-    gain = 1.0 + radius2 * (lens[camera, K1] + radius2 * lens[camera, K2])
+    focal = _per_observation(problem.focals_px * np.exp(lens[:, LOG_FOCAL, None]), camera)
+    centre = _per_observation(problem.centres_px + problem.shift_unit_px * lens[:, SHIFT_X : SHIFT_Y + 1], camera)
+    depth = np.maximum(in_camera[2], _MIN_DEPTH)
+    plane_xy = in_camera[:2] / depth
+    radius2 = plane_xy[0] ** 2 + plane_xy[1] ** 2
+    k1, k2 = _per_observation(lens[:, K1 : K2 + 1], camera)
+    gain = 1.0 + radius2 * (k1 + radius2 * k2)
     return _Projection(
+        rotation=rotation,
         rotated=rotated,
         depth=depth,
-        in_front=in_camera[:, 2] > _MIN_DEPTH,
+        in_front=in_camera[2] > _MIN_DEPTH,
         plane_xy=plane_xy,
         radius2=radius2,
+        k1=k1,
+        k2=k2,
         gain=gain,
         focal_px=focal,
-        residual=focal * plane_xy * gain[:, None] + centre - problem.pixel_xy,
+        residual=focal * plane_xy * gain + centre - problem.pixel_xy.T,
     )
+
+
+def _per_observation(values: np.ndarray, index: Int[np.ndarray, " observation"]) -> np.ndarray:
+    """Rows of a table by number, the number last."""
+    return np.ascontiguousarray(values.transpose(*range(1, values.ndim), 0)).take(index, axis=-1)
 
 
 def residuals(problem: BundleProblem) -> Float[np.ndarray, "observation 2"]:
     """Reprojected minus observed pixel, per observation."""
-    return _project(problem).residual
+    return _project(problem).residual.T
 
 
 def linearise(problem: BundleProblem) -> Linearisation:
     """Residuals and analytic Jacobians at the current parameters."""
-    camera = problem.camera_index
     at = _project(problem)
-    rotation = problem.rotations[camera]
-    k1, k2 = problem.lenses.values[problem.lens_index[camera]][:, [K1, K2]].T
+    count = len(problem.camera_index)
     # d distorted / d plane_xy = gain I + 2 (k1 + 2 k2 r^2) u u^T
-    bend = 2.0 * (k1 + 2.0 * k2 * at.radius2)
-    u, v = at.plane_xy.T
-    fx, fy = at.focal_px.T
-    across = np.empty((len(camera), 2, 2))
-    across[:, 0, 0] = fx * (at.gain + bend * u * u)
-    across[:, 0, 1] = fx * bend * u * v
-    across[:, 1, 0] = fy * bend * u * v
-    across[:, 1, 1] = fy * (at.gain + bend * v * v)
-    # d pixel / d point-in-camera.
-    projection = np.zeros((len(camera), 2, 3))
-    projection[:, :, :2] = across / at.depth[:, None, None]
-    along = across[:, :, 0] * u[:, None] + across[:, :, 1] * v[:, None]
-    projection[:, :, 2] = np.where(at.in_front[:, None], -along / at.depth[:, None], 0.0)
-    # d (exp([w]x) R X) / dw = -[R X]x
-    x, y, z = at.rotated.T
-    zero = np.zeros_like(x)
-    minus_cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+    bend = 2.0 * (at.k1 + 2.0 * at.k2 * at.radius2)
+    u, v = at.plane_xy
+    bend_u, bend_v = bend * u, bend * v
+    across = ((at.gain + bend_u * u, bend_u * v), (bend_u * v, at.gain + bend_v * v))
+    x, y, z = at.rotated
+    camera, point = np.empty((2, 6, count)), np.empty((2, 3, count))
+    for image_axis, (by_u, by_v) in enumerate(across):
+        scale = at.focal_px[image_axis] / at.depth
+        # d pixel / d point-in-camera; behind the camera depth is held.
+        by_x, by_y = scale * by_u, scale * by_v
+        by_z = np.where(at.in_front, -(by_x * u + by_y * v), 0.0)
+        # d (exp([w]x) R X) / dw = -[R X]x
+        row = camera[image_axis]
+        row[0], row[1], row[2] = by_z * y - by_y * z, by_x * z - by_z * x, by_y * x - by_x * y
+        row[3], row[4], row[5] = by_x, by_y, by_z
+        point[image_axis] = by_x * at.rotation[0] + by_y * at.rotation[1] + by_z * at.rotation[2]
     scaled = at.focal_px * at.plane_xy
-    lens = np.zeros((len(camera), 2, LENS_PARAMETERS))
-    lens[:, :, LOG_FOCAL] = scaled * at.gain[:, None]
-    lens[:, 0, SHIFT_X], lens[:, 1, SHIFT_Y] = problem.shift_unit_px[camera].T
-    lens[:, :, K1] = scaled * at.radius2[:, None]
-    lens[:, :, K2] = scaled * (at.radius2**2)[:, None]
-    return Linearisation(
-        residual=at.residual,
-        camera=np.concatenate([projection @ minus_cross, projection], 2),
-        point=projection @ rotation,
-        lens=lens,
-    )
+    lens = np.zeros((2, LENS_PARAMETERS, count))
+    lens[:, LOG_FOCAL] = scaled * at.gain
+    lens[0, SHIFT_X], lens[1, SHIFT_Y] = _per_observation(problem.shift_unit_px, problem.camera_index)
+    lens[:, K1] = scaled * at.radius2
+    lens[:, K2] = lens[:, K1] * at.radius2
+    return Linearisation(residual=at.residual, camera=camera, point=point, lens=lens)
 
 
 def robust_cost(problem: BundleProblem, residual: Float[np.ndarray, "observation 2"]) -> float:
@@ -275,14 +282,15 @@ class _NormalEquations:
     def __init__(self, problem: BundleProblem) -> None:
         self.problem = problem
         parts = linearise(problem)
-        weight = np.sqrt(1.0 / (1.0 + (parts.residual**2).sum(1) / problem.robust_px**2))
-        self._residual = parts.residual * weight[:, None]
-        self._jac_camera = parts.camera * weight[:, None, None]
-        self._jac_point = parts.point * weight[:, None, None]
-        self._jac_lens = parts.lens * weight[:, None, None]
+        weight = np.sqrt(1.0 / (1.0 + (parts.residual**2).sum(0) / problem.robust_px**2))
+        self._residual = parts.residual * weight
+        self._jac_camera = parts.camera * weight
+        self._jac_point = parts.point * weight
+        self._jac_lens = parts.lens * weight
         self._free = np.flatnonzero(problem.camera_free)
         # A lens that no observation looks through has nothing to say.
-        looked_through = np.unique(problem.lens_index[problem.camera_index])
+        self._cameras = np.flatnonzero(np.bincount(problem.camera_index))  # those with observations
+        looked_through = problem.lens_index[self._cameras]
         used = np.zeros(problem.lenses.values.shape, bool)
         used[looked_through, 1:] = True
         used[problem.lenses.focal_of[looked_through], LOG_FOCAL] = True
@@ -298,33 +306,33 @@ class _NormalEquations:
         count = len(problem.points)
         self._hessian = np.zeros((size, size))
         self._gradient = np.zeros(size)
-        self._coupling = np.zeros((size, count, 3)) if problem.points_free else None
+        self._coupling = np.zeros((size, 3, count)) if problem.points_free else None
         block_of = np.full(len(problem.camera_free), -1)
         block_of[self._free] = np.arange(len(self._free))
-        rows, parameters = self._free_lens.T
-        columns_of = [
-            np.flatnonzero(np.where(parameters == LOG_FOCAL, rows == problem.lenses.focal_of[lens], rows == lens))
-            for lens in range(len(problem.lenses.values))
-        ]
-        for camera in np.unique(problem.camera_index):
+        free_rows, free_parameters = self._free_lens.T
+        for camera in self._cameras:
             lens = int(problem.lens_index[camera])
-            own = columns_of[lens]
+            focal_row = problem.lenses.focal_of[lens]
+            own = np.flatnonzero(free_rows == np.where(free_parameters == LOG_FOCAL, focal_row, lens))
             parameters = self._free_lens[own, 1]
             columns = 6 * len(self._free) + own
             rows = np.flatnonzero(problem.camera_index == camera)
-            jacobian = self._jac_lens[rows][:, :, parameters]
+            jacobian = self._jac_lens[:, parameters][:, :, rows]
             if block_of[camera] >= 0:
                 columns = np.concatenate([6 * block_of[camera] + np.arange(6), columns])
-                jacobian = np.concatenate([self._jac_camera[rows], jacobian], 2)
+                jacobian = np.concatenate([self._jac_camera.take(rows, axis=2), jacobian], 1)
             if len(columns) == 0:
                 continue
-            flat = jacobian.reshape(-1, len(columns))
-            self._hessian[np.ix_(columns, columns)] += flat.T @ flat
-            self._gradient[columns] += flat.T @ self._residual[rows].reshape(-1)
+            flat = np.concatenate(list(jacobian), 1)
+            self._hessian[np.ix_(columns, columns)] += flat @ flat.T
+            self._gradient[columns] += flat @ self._residual.take(rows, axis=1).reshape(-1)
             if self._coupling is not None:
                 # Each point is seen at most once per camera: no index occurs twice here.
-                product = np.einsum("oic,oip->cop", jacobian, self._jac_point[rows])
-                self._coupling[columns[:, None], problem.point_index[rows][None]] += product
+                by_point = self._jac_point.take(rows, axis=2)
+                product = jacobian[0][:, None] * by_point[0] + jacobian[1][:, None] * by_point[1]
+                seen = problem.point_index[rows]
+                for place, part in zip(columns, product, strict=True):
+                    self._coupling[place][:, seen] += part
         lenses = problem.lenses
         for column, (lens, parameter) in enumerate(self._free_lens, start=6 * len(self._free)):
             weight = lenses.weight[lens, parameter]
@@ -334,40 +342,30 @@ class _NormalEquations:
     def _accumulate_points(self) -> None:
         """3x3 point blocks of J^T J and of the gradient."""
         index, count = self.problem.point_index, len(self.problem.points)
-        self._point_hessian = np.zeros((count, 3, 3))
-        self._point_gradient = np.zeros((count, 3))
+        self._point_hessian = np.zeros((3, 3, count))
+        self._point_gradient = np.zeros((3, count))
+        by_point = self._jac_point
         for i in range(3):
-            self._point_gradient[:, i] = np.bincount(
-                index, weights=(self._jac_point[:, :, i] * self._residual).sum(1), minlength=count
-            )
-            for j in range(i, 3):
-                entry = np.bincount(
-                    index, weights=(self._jac_point[:, :, i] * self._jac_point[:, :, j]).sum(1), minlength=count
-                )
-                self._point_hessian[:, i, j] = entry
-                self._point_hessian[:, j, i] = entry
+            weights = by_point[0, i] * self._residual[0] + by_point[1, i] * self._residual[1]
+            self._point_gradient[i] = np.bincount(index, weights=weights, minlength=count)
+            for j in range(i + 1):
+                weights = by_point[0, i] * by_point[0, j] + by_point[1, i] * by_point[1, j]
+                self._point_hessian[i, j] = np.bincount(index, weights=weights, minlength=count)
 
-    def _reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Schur complement of the points: (matrix, right-hand side, inverse point blocks)."""
+    def _reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray, _PointBlocks | None]:
+        """Schur complement of the points: (matrix, right-hand side, the points' blocks)."""
         hessian = self._hessian + np.diag(damping * np.diag(self._hessian) + 1e-12)
         if self._coupling is None:
             return hessian, -self._gradient, None
-        diagonal = np.einsum("pii->pi", self._point_hessian)
-        damped = self._point_hessian.copy()
-        # Points without observations keep a unit block: they do not move.
-        damped[:, [0, 1, 2], [0, 1, 2]] += damping * diagonal + np.where(diagonal > 0, 1e-12, 1.0)
-        inverse = np.linalg.inv(damped)
-        coupling = self._coupling
-        # Written out: einsum and batched matmul are an order slower on blocks this small.
-        product = sum(coupling[:, :, i, None] * inverse[None, :, i] for i in range(3))
-        eliminated = np.asarray(product).reshape(self._size, 3 * len(inverse))
-        matrix = hessian - eliminated @ coupling.reshape(self._size, 3 * len(inverse)).T
-        return matrix, -self._gradient + eliminated @ self._point_gradient.reshape(-1), inverse
+        blocks = _PointBlocks.factor(self._point_hessian, damping)
+        half = blocks.solve_half(self._coupling).reshape(self._size, self._point_gradient.size)
+        matrix = hessian - half @ half.T
+        return matrix, -self._gradient + half @ blocks.solve_half(self._point_gradient).reshape(-1), blocks
 
     def step(self, damping: float) -> BundleProblem:
         """The problem after one damped Gauss-Newton step."""
         problem = self.problem
-        matrix, rhs, inverse = self._reduced(damping)
+        matrix, rhs, blocks = self._reduced(damping)
         delta = np.linalg.lstsq(matrix, rhs, rcond=None)[0] if self._size else np.zeros(0)
         rotations, translations = problem.rotations.copy(), problem.translations.copy()
         for block, camera in enumerate(self._free):
@@ -375,9 +373,9 @@ class _NormalEquations:
             rotations[camera] = rotation_exp(move[:3]) @ rotations[camera]
             translations[camera] = translations[camera] + move[3:]
         points = problem.points
-        if self._coupling is not None and inverse is not None:
-            pull = -self._point_gradient - np.einsum("cpi,c->pi", self._coupling, delta)
-            points = points + np.einsum("pij,pj->pi", inverse, pull)
+        if self._coupling is not None and blocks is not None:
+            pull = -self._point_gradient - np.tensordot(delta, self._coupling, 1)
+            points = points + blocks.solve(pull).T
         lenses = problem.lenses
         if len(self._free_lens):
             values = lenses.values.copy()
@@ -400,6 +398,45 @@ class _NormalEquations:
         variances = np.diag(covariance)[6 * len(self._free) :]
         sigma[tuple(self._free_lens.T)] = np.sqrt(np.maximum(variances, 0.0))
         return sigma
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _PointBlocks:
+    """Damped 3x3 blocks of all points as L D L^T, written out: LAPACK's calls cost more than the arithmetic of blocks this small."""
+
+    inverse_root: Float[np.ndarray, "3 point"]  # D^-1/2
+    m10: Float[np.ndarray, " point"]  # of L^-1, below its diagonal of ones
+    m20: Float[np.ndarray, " point"]
+    m21: Float[np.ndarray, " point"]
+
+    @classmethod
+    def factor(cls, hessian: Float[np.ndarray, "3 3 point"], damping: float) -> _PointBlocks:
+        """Blocks of which only the lower triangle is read. Points without observations get a unit block: they do not move."""
+        diagonal = hessian[[0, 1, 2], [0, 1, 2]]
+        a00, a11, a22 = diagonal * (1.0 + damping) + np.where(diagonal > 0, 1e-12, 1.0)
+        a10, a20, a21 = hessian[1, 0], hessian[2, 0], hessian[2, 1]
+        l10, l20 = a10 / a00, a20 / a00
+        d1 = a11 - l10 * a10
+        l21 = (a21 - l20 * a10) / d1
+        d2 = a22 - l20 * a20 - l21 * l21 * d1
+        # A block that rounding has made indefinite moves its point nowhere instead of anywhere.
+        pivots = np.stack([a00, d1, d2])
+        root = np.sqrt(np.where(pivots > _LEAST_PIVOT * np.stack([a00, a11, a22]), pivots, np.inf))
+        return cls(inverse_root=1.0 / root, m10=-l10, m20=l10 * l21 - l20, m21=-l21)
+
+    def solve_half(self, values: Float[np.ndarray, "*columns 3 point"]) -> Float[np.ndarray, "*columns 3 point"]:
+        """D^-1/2 L^-1 values: products of two such results are products with the blocks' inverses."""
+        x, y, z = values[..., 0, :], values[..., 1, :], values[..., 2, :]
+        half = np.empty_like(values)
+        np.multiply(x, self.inverse_root[0], out=half[..., 0, :])
+        np.multiply(y + self.m10 * x, self.inverse_root[1], out=half[..., 1, :])
+        np.multiply(z + self.m20 * x + self.m21 * y, self.inverse_root[2], out=half[..., 2, :])
+        return half
+
+    def solve(self, values: Float[np.ndarray, "3 point"]) -> Float[np.ndarray, "3 point"]:
+        """The blocks' inverses times values."""
+        x, y, z = self.solve_half(values) * self.inverse_root
+        return np.stack([x + self.m10 * y + self.m20 * z, y + self.m21 * z, z])
 
 
 def rotation_exp(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:

@@ -106,9 +106,12 @@ def _not_isolated(xy: Array64, depth: Array64, *, neighbours: int = 6, log_gap: 
     """
     if len(depth) <= neighbours:
         return np.ones(len(depth), bool)
-    squared = ((xy[:, None] - xy[None]) ** 2).sum(-1)
-    np.fill_diagonal(squared, np.inf)
-    nearest = np.argpartition(squared, neighbours, axis=1)[:, :neighbours]
+    from scipy.spatial import cKDTree
+
+    nearest = cKDTree(xy).query(xy, k=neighbours + 1)[1]
+    itself = nearest == np.arange(len(xy))[:, None]
+    itself[~itself.any(axis=1), -1] = True  # among more points at one place than are asked for
+    nearest = nearest[~itself].reshape(len(xy), neighbours)
     log_depth = np.log(depth)
     return (np.abs(log_depth[nearest] - log_depth[:, None]) < log_gap).sum(axis=1) >= 2
 

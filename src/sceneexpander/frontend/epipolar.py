@@ -73,31 +73,32 @@ class EpipolarFit:
             step = max(1, len(other.own_xy) // _MOST_MATCHES)
             own = np.concatenate([other.own_xy[::step], np.ones((len(other.own_xy[::step]), 1))], 1)
             world_from_pixel = other.rotation.T @ np.linalg.inv(other.intrinsics)
-            rays.append(own @ world_from_pixel.T)
-            centres.append(np.broadcast_to(-other.rotation.T @ other.translation, (len(own), 3)))
-            view_xy.append(other.view_xy[::step])
-            to_pixels.append(np.broadcast_to(world_from_pixel[:, :2], (len(own), 3, 2)))
-        self._rays, self._centres = np.concatenate(rays), np.concatenate(centres)
-        self._view = np.concatenate([np.concatenate(view_xy), np.ones((len(self._rays), 1))], 1)
-        self._to_pixels = np.concatenate(to_pixels)
+            rays.append(world_from_pixel @ own.T)
+            centres.append(np.broadcast_to((-other.rotation.T @ other.translation)[:, None], (3, len(own))))
+            view_xy.append(other.view_xy[::step].T)
+            to_pixels.append(np.broadcast_to(world_from_pixel[:, :2, None], (3, 2, len(own))))
+        # Matches come last: what is done to all of them then runs along memory.
+        self._rays, self._centres = np.concatenate(rays, 1), np.concatenate(centres, 1)
+        self._view = np.concatenate([*np.concatenate(view_xy, 1), np.ones(self.count)]).reshape(3, -1)
+        self._to_pixels = np.concatenate(to_pixels, 2)
 
     @property
     def count(self) -> int:
         """Number of matches looked at."""
-        return len(self._rays)
+        return self._rays.shape[1]
 
     def errors_px(
         self, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"], lens: Float[np.ndarray, " 5"]
     ) -> Float[np.ndarray, " match"]:
         """Signed Sampson distance of each match."""
         world_from_pixel = rotation.T @ np.linalg.inv(intrinsics_through(self._start, self._shift_unit, lens))
-        view_rays = self._view @ world_from_pixel.T
-        base = self._centres + rotation.T @ translation  # from this camera to the other
-        normal = np.cross(base, self._rays)  # of the epipolar plane through the other view's ray
-        algebraic = (view_rays * normal).sum(1)
-        by_view = normal @ world_from_pixel[:, :2]
-        by_other = np.einsum("mi,mij->mj", np.cross(view_rays, base), self._to_pixels)
-        slope = np.sqrt((by_view**2).sum(1) + (by_other**2).sum(1))
+        view_rays = world_from_pixel @ self._view
+        base = self._centres + (rotation.T @ translation)[:, None]  # from this camera to the other
+        normal = _cross(base, self._rays)  # of the epipolar plane through the other view's ray
+        algebraic = (view_rays * normal).sum(0)
+        by_view = world_from_pixel[:, :2].T @ normal
+        by_other = (_cross(view_rays, base)[:, None] * self._to_pixels).sum(0)
+        slope = np.sqrt((by_view**2).sum(0) + (by_other**2).sum(0))
         return algebraic / np.maximum(slope, 1e-12)
 
     def behind(
@@ -105,10 +106,10 @@ class EpipolarFit:
     ) -> Bool[np.ndarray, " match"]:
         """Which matches meet behind one of the cameras. Rays that are nearly parallel meet nowhere for certain, and are not counted."""
         world_from_pixel = rotation.T @ np.linalg.inv(intrinsics_through(self._start, self._shift_unit, lens))
-        view_rays = self._view @ world_from_pixel.T
-        base = self._centres + rotation.T @ translation
-        aa, bb, ab = (view_rays**2).sum(1), (self._rays**2).sum(1), (view_rays * self._rays).sum(1)
-        a_base, b_base = (view_rays * base).sum(1), (self._rays * base).sum(1)
+        view_rays = world_from_pixel @ self._view
+        base = self._centres + (rotation.T @ translation)[:, None]
+        aa, bb, ab = (view_rays**2).sum(0), (self._rays**2).sum(0), (view_rays * self._rays).sum(0)
+        a_base, b_base = (view_rays * base).sum(0), (self._rays * base).sum(0)
         across = aa * bb - ab**2
         depths = np.stack([bb * a_base - ab * b_base, ab * a_base - aa * b_base])  # times ``across``, which is positive
         return (depths < 0).any(0) & (across > _PARALLEL**2 * aa * bb)
@@ -130,7 +131,7 @@ class EpipolarFit:
     ) -> EpipolarView:
         """The nearest pose and lens that leave least unexplained: Levenberg-Marquardt on a Cauchy loss."""
         columns = np.flatnonzero(freedom.free)
-        base = np.linalg.norm(self._centres + rotation.T @ translation, axis=1)
+        base = np.linalg.norm(self._centres + (rotation.T @ translation)[:, None], axis=0)
         length = max(float(np.median(base)), 1e-9)
         weight = np.zeros(6 + len(columns))
         weight[6:] = _PRIOR_INFLATION * (self._noise / freedom.sigma[columns]) ** 2
@@ -170,6 +171,10 @@ class EpipolarFit:
             if before - cost < 1e-5 * before:
                 break
         return self.judge(*moved(x))
+
+
+def _cross(a: Float[np.ndarray, "3 match"], b: Float[np.ndarray, "3 match"]) -> Float[np.ndarray, "3 match"]:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def held_lens() -> LensFreedom:

@@ -44,6 +44,7 @@ from sceneexpander.frontend.twoview import (
     PairMatches,
     fit_rotation,
     match_and_verify,
+    match_descriptors,
     rotation_focal,
     scaled_focal,
 )
@@ -110,13 +111,15 @@ def estimate_cameras(
     plan = LensPlan.make(config, setup, known, own, focal_hint_px)
     features = [detect_features(grey, config) for grey in setup.greys]
     features = [own.select(lie_in(mask, own.pixel_xy)) for own, mask in zip(features, setup.shown, strict=True)]
-    pairs = _match_all(features, None, config, setup)
+    described = _match_descriptors(features, config)
+    pairs = _match_all(features, described, None, config, setup)
     spots = find_overlay(features, pairs, setup.unit_px)
     if spots is not None:
         setup = setup.without(spots)
         features = [own.select(lie_in(mask, own.pixel_xy)) for own, mask in zip(features, setup.shown, strict=True)]
-        pairs = _match_all(features, None, config, setup)
-    model = _model(features, None, known, plan, config, setup, pairs=pairs)
+        described = _match_descriptors(features, config)
+        pairs = _match_all(features, described, None, config, setup)
+    model = _model(features, described, None, known, plan, config, setup, pairs=pairs)
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
     if choosing and judge is not None and not known.posed.all():
         candidates = [model, *_learned_models(model, (False, True), known, plan, config, setup)]
@@ -134,10 +137,23 @@ def estimate_cameras(
     return _reconstruction(model, plan, config, setup)
 
 
+def _match_descriptors(features: list[Features], config: SfmConfig) -> dict[tuple[int, int], Matches]:
+    """Of all pairs of views, the first before the second."""
+    return {
+        (a, b): match_descriptors(features[a], features[b], config)
+        for a in range(len(features))
+        for b in range(a + 1, len(features))
+    }
+
+
 def _match_all(
-    features: list[Features], learned: _Learned | None, config: SfmConfig, setup: Setup
+    features: list[Features],
+    described: dict[tuple[int, int], Matches],
+    learned: _Learned | None,
+    config: SfmConfig,
+    setup: Setup,
 ) -> list[PairMatches]:
-    """All pairs of views, matched and verified."""
+    """All pairs of views, their matches of descriptors joined by learned ones and verified."""
     return [
         match_and_verify(
             a,
@@ -146,11 +162,11 @@ def _match_all(
             config,
             unit_px=setup.unit_px,
             seed=setup.seed,
+            described=loose,
             learned=None if learned is None else learned.matches.get((a, b)),
             learned_leads=learned is not None and learned.lead,
         )
-        for a in range(len(features))
-        for b in range(a + 1, len(features))
+        for (a, b), loose in described.items()
     ]
 
 
@@ -237,6 +253,7 @@ class _Model:
     """A finished mapping and what it was made from."""
 
     raw: list[Features]  # as the lens shows them
+    described: dict[tuple[int, int], Matches]  # matches of their descriptors, before any is verified
     features: list[Features]  # straightened
     pairs: list[PairMatches]
     kinds: list[PairKind]
@@ -261,6 +278,7 @@ class _Learned:
 
 def _model(
     features: list[Features],
+    described: dict[tuple[int, int], Matches],
     learned: _Learned | None,
     known: KnownCameras,
     plan: LensPlan,
@@ -276,19 +294,20 @@ def _model(
     of that before, ``pairs`` are the matches if they are known already.
     """
     found, narrowed = distortion, plan
-    model = _solved(features, found, learned, known, narrowed, config, setup, pairs=pairs)
+    model = _solved(features, described, found, learned, known, narrowed, config, setup, pairs=pairs)
     for _ in range(config.distortion_rounds if plan.refine and not known.posed.any() else 0):
         found = find_distortion(model.mapping, model.distortion)
         if found is None:
             break
         ratio = float(found.intrinsics[plan.main, 0, 0] / plan.units_px[plan.main, 0])
         narrowed = replace(plan, starts=(replace(plan.starts[0], ratio=ratio),))
-        model = _solved(features, found, learned, known, narrowed, config, setup)
+        model = _solved(features, described, found, learned, known, narrowed, config, setup)
     return model
 
 
 def _solved(
     raw: list[Features],
+    described: dict[tuple[int, int], Matches],
     distortion: Distortion | None,
     learned: _Learned | None,
     known: KnownCameras,
@@ -303,7 +322,7 @@ def _solved(
     if distortion is not None:
         features = [replace(own, pixel_xy=distortion.undistorted(view, own.pixel_xy)) for view, own in enumerate(raw)]
     if pairs is None:
-        pairs = _match_all(features, learned, config, setup)
+        pairs = _match_all(features, described, learned, config, setup)
     found = _pair_kinds(features, pairs, plan, config, setup, frozenset() if learned is None else learned.turns)
     search = CameraSearch(
         features=features, pairs=pairs, found=found, known=known, plan=plan, config=config, setup=setup
@@ -311,6 +330,7 @@ def _solved(
     mapping, source = search.run()
     return _Model(
         raw=raw,
+        described=described,
         features=features,
         pairs=pairs,
         kinds=found.kinds,
@@ -356,6 +376,7 @@ def _learned_models(
     return [
         _model(
             features,
+            model.described,
             _Learned(matches=matches, lead=lead, turns=turns),
             known,
             nearby,

@@ -74,6 +74,13 @@ def _robust_matrix(
     return None if matrix is None or mask is None or matrix.shape != (3, 3) else (matrix, mask)
 
 
+def match_descriptors(a: Features, b: Features, config: SfmConfig) -> Matches:
+    """Mutual neighbours of the descriptors of two views, at the loose ratio."""
+    if min(a.described, b.described) < 2:
+        return Matches.empty()
+    return mutual_matches(similarity(a, b), config.loose_match_ratio)
+
+
 def match_and_verify(
     view_a: int,
     view_b: int,
@@ -82,6 +89,7 @@ def match_and_verify(
     *,
     unit_px: float,
     seed: int,
+    described: Matches | None = None,
     learned: Matches | None = None,
     learned_leads: bool = False,
 ) -> PairMatches:
@@ -94,15 +102,14 @@ def match_and_verify(
         config: ratios and thresholds.
         unit_px: pixels per pixel at the reference size (thresholds are multiplied by it).
         seed: of the robust fit.
+        described: `match_descriptors` of the views, if it was asked before.
         learned: matches between the views' keypoints without descriptors, counted from the first of those; they are
             verified together with the others.
         learned_leads: only descriptor matches near the geometry of the learned ones take part, where those agree on one.
             Descriptors see a few pixels and agree on the wrong window of a facade; the learned matcher sees the picture.
     """
     a, b = features[view_a], features[view_b]
-    loose = Matches.empty()
-    if min(a.described, b.described) >= 2:
-        loose = mutual_matches(similarity(a, b), config.loose_match_ratio)
+    loose = match_descriptors(a, b, config) if described is None else described
     strict = loose.select(loose.ratio <= config.match_ratio)
     if learned is not None:
         own = Matches.empty().joined(learned, offset_a=a.described, offset_b=b.described)

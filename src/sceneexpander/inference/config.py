@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 from sceneexpander.errors import UserError
 from sceneexpander.ranges import Range, check_ranges
 
+NEEDS_CHECKPOINT = "needs the public checkpoint"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RivalConfig:

@@ -21,13 +21,12 @@ from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import camera_vector_from_pose, resize_intrinsics
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.inference.artefact import as_reconstruction
-from sceneexpander.inference.config import RivalConfig
+from sceneexpander.inference.config import NEEDS_CHECKPOINT, RivalConfig
 from sceneexpander.models.derived import with_depth
 from sceneexpander.models.protocol import Head, Prediction, Reconstructor, as_module
 from sceneexpander.models.registry import build_reconstructor
 
 EDGE = 1.05  # ratio of depths in a 3 x 3 window above which nothing is interpolated across it
-NEEDS_CHECKPOINT = "needs the public checkpoint"
 
 
 def reconstruct_rival(

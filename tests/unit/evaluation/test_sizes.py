@@ -9,7 +9,8 @@ import torch
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import to_bytes
-from sceneexpander.evaluation import EvaluateConfig, evaluate
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.evaluation.sizes import at_sizes
 from sceneexpander.geometry.camera import resize_intrinsics
 from sceneexpander.splatting import render

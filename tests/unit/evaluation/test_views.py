@@ -11,9 +11,16 @@ import torch
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.errors import UserError
-from sceneexpander.evaluation import EvaluateConfig, Navigation, evaluate, navigation_coverage, same_place
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.evaluate import Navigation, evaluate
 from sceneexpander.evaluation.image import psnr
-from sceneexpander.evaluation.views import PSNR_CAP_DB, insertion_fidelity, preservation
+from sceneexpander.evaluation.views import (
+    PSNR_CAP_DB,
+    insertion_fidelity,
+    navigation_coverage,
+    preservation,
+    same_place,
+)
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from tests.unit.evaluation.made import HEIGHT, WIDTH, made_reconstruction, own_pictures, without_generated

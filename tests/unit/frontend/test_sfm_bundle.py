@@ -31,7 +31,7 @@ def test_jacobians_equal_finite_differences() -> None:
     start = worlds.with_lens(worlds.bundle_problem(world), values=bent)
     problem = worlds.perturbed(start, 1, angle=0.05, shift=0.1, spread=0.1)
     parts = linearise(problem)
-    np.testing.assert_allclose(parts.residual, residuals(problem), atol=1e-10)
+    np.testing.assert_allclose(parts.residual.T, residuals(problem), atol=1e-10)
     step = 1e-6
 
     def central(change) -> np.ndarray:  # type: ignore[no-untyped-def]
@@ -53,18 +53,18 @@ def test_jacobians_equal_finite_differences() -> None:
                 return replace(problem, translations=translations)
 
             # Derivatives are of the order of the focal (650); central differences are good to about 1e-5 of that.
-            np.testing.assert_allclose(central(turned)[mine], parts.camera[mine, :, axis], atol=1e-3)
+            np.testing.assert_allclose(central(turned)[mine], parts.camera[:, axis, mine].T, atol=1e-3)
             np.testing.assert_allclose(central(turned)[~mine], 0, atol=1e-12)
-            np.testing.assert_allclose(central(moved)[mine], parts.camera[mine, :, 3 + axis], atol=1e-3)
+            np.testing.assert_allclose(central(moved)[mine], parts.camera[:, 3 + axis, mine].T, atol=1e-3)
     for axis in range(3):
 
         def shifted(h: float, axis: int = axis):  # type: ignore[no-untyped-def]
             return replace(problem, points=problem.points + h * np.eye(3)[axis])
 
-        np.testing.assert_allclose(central(shifted), parts.point[:, :, axis], atol=1e-3)
+        np.testing.assert_allclose(central(shifted), parts.point[:, axis].T, atol=1e-3)
     for parameter in range(LENS_PARAMETERS):
         other = central(lambda h, p=parameter: worlds.with_lens(problem, values={p: bent[p] + h}))
-        np.testing.assert_allclose(other, parts.lens[:, :, parameter], atol=1e-3)
+        np.testing.assert_allclose(other, parts.lens[:, parameter].T, atol=1e-3)
 
 
 @pytest.mark.parametrize("focal_free", [False, True])
@@ -238,3 +238,12 @@ def test_rotation_exp_is_a_rotation_and_accurate_near_zero() -> None:
         assert np.linalg.det(rotation) == pytest.approx(1.0)
     half_turn = rotation_exp(np.array([0.0, 0.0, np.pi / 2]))
     np.testing.assert_allclose(half_turn @ np.array([1.0, 0, 0]), [0, 1, 0], atol=1e-12)
+
+
+def test_points_move_to_their_rays_where_all_cameras_are_held() -> None:
+    world = worlds.point_world(2)
+    problem = worlds.bundle_problem(world, camera_free=np.zeros(len(world.rotations), bool))
+    start = replace(problem, points=problem.points + 0.05)
+    result = adjust(start)
+    np.testing.assert_allclose(result.problem.points, world.points, atol=1e-6)
+    np.testing.assert_array_equal(result.problem.rotations, world.rotations)

@@ -18,9 +18,8 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.geometry.camera import intrinsics_from_parts, resize_intrinsics, unproject_to_world
 from sceneexpander.geometry.priors import Priors
-from sceneexpander.inference.config import RivalConfig, RivalsConfig
+from sceneexpander.inference.config import NEEDS_CHECKPOINT, RivalConfig, RivalsConfig
 from sceneexpander.inference.rivals import (
-    NEEDS_CHECKPOINT,
     at_stored_size,
     reconstruct_rival,
     resized_depth,

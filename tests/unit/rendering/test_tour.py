@@ -16,7 +16,9 @@ from sceneexpander.errors import UserError
 from sceneexpander.geometry.camera import camera_vector_from_pose
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.rigid import rotation_angle_deg
-from sceneexpander.rendering import EyeKey, RenderConfig, ViewKey, plan_tour, produce_renders
+from sceneexpander.rendering.config import EyeKey, RenderConfig, ViewKey
+from sceneexpander.rendering.produce import produce_renders
+from sceneexpander.rendering.tour import plan_tour
 from sceneexpander.splatting.spz import read_spz
 
 HEIGHT, WIDTH = 21, 28

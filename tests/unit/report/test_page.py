@@ -21,7 +21,8 @@ from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_a
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.optimisation.refine import RefineReport
-from sceneexpander.rendering import RenderConfig, produce_renders
+from sceneexpander.rendering.config import RenderConfig
+from sceneexpander.rendering.produce import produce_renders
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene, write_page
 from sceneexpander.report.course import fits
 from sceneexpander.report.curve import Curve, curve_chart, objective_curves
