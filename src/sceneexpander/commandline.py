@@ -39,4 +39,4 @@ class CommandParser(argparse.ArgumentParser):
                 raise UserError(
                     "unknown option", where=printable(word), fix=did_you_mean(word.partition("=")[0], known)
                 )
-        raise UserError(message, where=self.prog, fix=f"{self.prog} --help shows examples")
+        raise UserError(message, where=self.prog, fix=f"e.g. {self.prog} {self.examples[0]}".rstrip())
