@@ -21,11 +21,11 @@ from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import entry_point
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.expansion import initial_state
-from sceneexpander.expansion.loaded import load_model
 from sceneexpander.ingest import load_scene
 from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.optimisation.refine import refine
 from sceneexpander.project import find_project
+from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 
 COVERED = 0.5  # alpha from which on a pixel counts

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from sceneexpander.config.compose import compose, scene_option
@@ -13,11 +13,20 @@ from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation import check_truth
 from sceneexpander.evaluation.image import WINDOW
-from sceneexpander.expansion import ModelConfig, load_model
 from sceneexpander.generation import generate_inserted_view
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
 from sceneexpander.models.weights import HUB_ID
+from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+
+
+@dataclass(slots=True)
+class Checked:
+    """What this command has looked at already, so that scenes and jobs that share it do not wait for it again."""
+
+    weights: set[ModelConfig] = field(default_factory=set)
+    pictures: dict[Hashable, int] = field(default_factory=dict)  # number of rounds
+
 
 CHECKED_SECTIONS = ("seed", "scene", "generator", "model", "rivals")  # of the configuration, beside the device
 
@@ -31,6 +40,7 @@ def check_scene(
     rounds: int | None = None,
     methods: Sequence[str] = (),
     device: bool = True,
+    checked: Checked | None = None,
 ) -> int:
     """Compose the configuration for a scene and read all of its pictures; nothing is written.
 
@@ -42,6 +52,7 @@ def check_scene(
         rounds: how many rounds are to run; None: all that the scene defines.
         methods: that are to run; reconstructors of others among them that have no weights will say so in their rows.
         device: whether the device must be there; not on a machine that only hands jobs to others.
+        checked: of the same command's earlier calls; weights are loaded and pictures decoded once.
 
     Returns:
         the number of rounds.
@@ -52,6 +63,31 @@ def check_scene(
     config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
     if device:
         check_device(config.device)
+    checked = Checked() if checked is None else checked
+    pictures = folder, config.scene, config.generator, rounds
+    if pictures not in checked.pictures:
+        checked.pictures[pictures] = _check_pictures(folder, config, rounds)
+    needed = [config.model]
+    for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
+        section = config.rivals.of(rival)
+        if section.weights is not None:
+            needed.append(
+                ModelConfig(
+                    name=rival,
+                    variant=section.variant,
+                    weights=section.weights,
+                    allow_download=section.allow_download,
+                )
+            )
+    for model in needed:
+        if model not in checked.weights:
+            check_weights(model)
+            checked.weights.add(model)
+    return checked.pictures[pictures]
+
+
+def _check_pictures(folder: Path, config: ProjectConfig, rounds: int | None) -> int:
+    """Read the photos, the pictures to insert and what is known of the truth; the number of rounds."""
     scene = load_scene(folder, config.scene)
     if min(scene.views.height, scene.views.width) < WINDOW:
         size = f"{scene.views.width} x {scene.views.height}"
@@ -66,18 +102,6 @@ def check_scene(
         inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator)
         records += inserted.view.records
     check_truth(folder, records)  # read by the last stages only, so a mistake in it would cost the whole run
-    check_weights(config.model)
-    for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
-        section = config.rivals.of(rival)
-        if section.weights is not None:
-            check_weights(
-                ModelConfig(
-                    name=rival,
-                    variant=section.variant,
-                    weights=section.weights,
-                    allow_download=section.allow_download,
-                )
-            )
     return count
 
 

@@ -11,11 +11,14 @@ from sceneexpander.artifacts.inserted import Provenance
 from sceneexpander.artifacts.store import sha256_of_bytes
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.errors import UserError, did_you_mean
+from sceneexpander.generation.config import GeneratorConfig
 from sceneexpander.generation.protocol import Candidate, GenerationContext, ViewGenerator
 from sceneexpander.ingest.decode import LIMIT_BYTES
 from sceneexpander.ingest.links import require_inside
 from sceneexpander.ingest.survey import list_pictures
 from sceneexpander.plainfiles import read_plain_file
+
+FILE_BACKEND = "file"
 
 
 def make_generator(context: GenerationContext) -> ViewGenerator:
@@ -62,19 +65,25 @@ class FileGenerator:
 
     def generate(self, references: ViewSet, prompt: str) -> list[Candidate]:
         """The one picture. Relative paths start at the working directory. See `ViewGenerator`."""
-        given = self.context.config.file
-        if not given:
+        path = picture_file(self.context.config, self.context.round_number)
+        if path is None:
             raise UserError("is not set", where="generator.file", fix="give the path of your picture")
-        named = given if os.path.isfile(given) else given.replace("{round}", str(self.context.round_number))
-        path = Path(os.path.expanduser(named))  # unlike Path's own, no error for a "~name" that is nobody's home
         if os.path.isdir(path):
             raise UserError(f"{path} is a folder", where="generator.file", fix="give the path of one picture")
         return [_stored(path, path.parent, "file", prompt, references)]
 
 
+def picture_file(config: GeneratorConfig, round_number: int) -> Path | None:
+    """The picture outside of the scene folder that a round takes; None if it takes none, or none is named."""
+    if config.backend != FILE_BACKEND or not config.file:
+        return None
+    named = config.file if os.path.isfile(config.file) else config.file.replace("{round}", str(round_number))
+    return Path(os.path.expanduser(named))  # unlike Path's own, no error for a "~name" that is nobody's home
+
+
 BACKENDS: dict[str, Callable[[GenerationContext], ViewGenerator]] = {
     "replay": ReplayGenerator,
-    "file": FileGenerator,
+    FILE_BACKEND: FileGenerator,
 }
 
 
