@@ -114,3 +114,18 @@ def anchors(page: Path) -> set[str]:
     """Of headings, as forges make them."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def conventions() -> list[str]:
+    text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    return [line for line in text.splitlines() if line.startswith("| ") and not line.startswith("| convention")]
+
+
+@pytest.mark.parametrize("line", conventions(), ids=lambda line: line[2:40])
+def test_a_convention_names_a_test_that_there_is(line: str) -> None:
+    sentence, held_by = line.strip("| ").split(" | ")
+    assert sentence.endswith(".")
+    file, _, name = held_by.strip("`").partition("::")
+    path = ROOT / "tests" / (file if file.startswith("pipeline") else f"unit/{file}")
+    defined = {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)}
+    assert name in defined
