@@ -29,7 +29,7 @@ from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.inputs import AdaptationInputs, StepViews, geometry_of
 from sceneexpander.adaptation.loop import Run
 from sceneexpander.adaptation.objective import anchor_targets, step_losses
-from sceneexpander.adaptation.sampling import sample_batch
+from sceneexpander.adaptation.sampling import Batch, sample_batch
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.models.mini import Mini
@@ -77,6 +77,8 @@ def setting(name: str) -> Setting:
     captured = None if priors is None else priors.select(range(views - 1))
     with torch.no_grad():
         frozen = model.predict(images[:-1], captured, heads=GEOMETRY_HEADS)
+    assert frozen.depth is not None and frozen.depth_conf is not None  # noqa: PT018 - heads that were asked for
+    assert frozen.normals is not None and frozen.normals_conf is not None  # noqa: PT018
     anchors = Anchors(
         weights_sha256="0",
         view_ids=tuple(str(i) for i in range(views - 1)),
@@ -100,9 +102,9 @@ class Naive:
         self.teacher = copy.deepcopy(model)
         self.frozen = copy.deepcopy(model)  # made the anchors; stays
         self.start = [p.detach().clone() for p in as_module(model).parameters()]
-        self.source = Run(copy.deepcopy(model), inputs, CONFIG, 0).source  # the same views as ours
+        ours = Run(copy.deepcopy(model), inputs, CONFIG, 0)
+        self.source, self.anchors = ours.source, ours.learner.anchors  # the same views and targets as ours
         self.optimiser = torch.optim.AdamW(as_module(model).parameters(), lr=CONFIG.learning_rate, foreach=False)
-        self.anchors = geometry_of(inputs.anchors)
 
     def step(self, step: int) -> None:
         """One step."""
@@ -118,7 +120,7 @@ class Naive:
         for parameter, start in zip(as_module(self.student).parameters(), self.start, strict=True):
             loss = loss + CONFIG.lambda_reg * (parameter - start).square().sum()
         self.optimiser.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()
         with torch.no_grad():
             pairs = zip(as_module(self.teacher).parameters(), as_module(self.student).parameters(), strict=True)
@@ -130,7 +132,7 @@ class Naive:
                     parameter.copy_(torch.where(mask, start, parameter))
 
 
-def unprepared(naive: Naive, batch: object, step: int) -> StepViews:
+def unprepared(naive: Naive, batch: Batch, step: int) -> StepViews:
     """The step's views without anything measured in advance."""
     prepared = naive.source.views(batch, step)
     priors = naive.inputs.joint_priors if batch.inserted else naive.inputs.captured_priors
@@ -156,7 +158,7 @@ class Floor:
         assert self.views is not None
         views, inserted = self.views
         student = geometry_of(views.predict(self.naive.student))
-        (student.depth.mean() + student.normals.mean() + student.camera_vector.mean()).backward()
+        (student.depth.mean() + student.normals.mean() + student.camera_vector.mean()).backward()  # type: ignore[no-untyped-call]
         as_module(self.naive.student).zero_grad()
         if inserted:
             with torch.inference_mode():

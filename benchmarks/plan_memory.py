@@ -15,6 +15,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -108,12 +109,12 @@ def run_steps(case: Case) -> int:
         learner.anchors = anchors(seen - 1, height, width)
         views = StepViews(images=images, priors=None, prepared=prepared, grids=[])
         batch = Batch(captured=tuple(range(seen - 1)), inserted=True)
-        learner.losses(views, batch).objective.backward()
+        learner.losses(views, batch).objective.backward()  # type: ignore[no-untyped-call]
         learner.ledger.update(number)
     return resident("VmHWM")
 
 
-def filled(prepared: object) -> object:
+def filled(prepared: Any) -> Any:
     """The shapes of a plan with numbers that a network can bear."""
     priors = prepared.priors
     for name in ("depth", "confident"):

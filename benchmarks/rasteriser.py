@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from gsplat_reference import run_gsplat
@@ -43,8 +44,13 @@ def run_ours(scene: Scene, backend: str, threads: int) -> Callable[[], tuple[Ten
 
     def forward() -> tuple[Tensor, list[Tensor]]:
         leaves = scene.leaves()
+        means, quat_wxyz, scales, opacities, colours = leaves
         out = rasterise(
-            *leaves,
+            means,
+            quat_wxyz,
+            scales,
+            opacities,
+            colours,
             scene.viewmat[None],
             scene.intrinsics[None],
             scene.height,
@@ -67,14 +73,16 @@ class Timing:
     both_wall: float
 
 
-def measure(scene: Scene, forward: Callable[[], tuple[Tensor, ...]], repeats: int, warm_up: int = 1) -> Timing:
+def measure(
+    scene: Scene, forward: Callable[[], tuple[Tensor, Any] | tuple[Tensor, Any, Any]], repeats: int, warm_up: int = 1
+) -> Timing:
     """Time forward and forward + backward of the squared-error loss."""
     rows = []
     for repeat in range(repeats + warm_up):
         cpu, wall = time.process_time(), time.perf_counter()
         image = forward()[0]
         cpu_forward, wall_forward = time.process_time() - cpu, time.perf_counter() - wall
-        ((image - scene.target) ** 2).mean().backward()
+        ((image - scene.target) ** 2).mean().backward()  # type: ignore[no-untyped-call]
         if repeat >= warm_up:
             rows.append((cpu_forward, time.process_time() - cpu, wall_forward, time.perf_counter() - wall))
         del image
@@ -91,15 +99,15 @@ def usable_builds() -> dict[str, str]:
 
 def measure_kernels(scene: Scene, repeats: int) -> dict[str, Timing]:
     """Every usable build on one thread, the one that would be chosen also on two."""
-    timings = {}
+    timings: dict[str, Timing] = {}
     for build, level in usable_builds().items():
         kernel = kernel_backend.open_build(build)
-        kernel_backend.load_kernel = lambda kernel=kernel: kernel  # type: ignore[assignment,misc]
+        kernel_backend.load_kernel = lambda kernel=kernel: kernel  # type: ignore[assignment]
         for threads in (1, 2) if not timings else (1,):
             name = f"kernel {level}, {threads} thread{'s'[: threads - 1]}"
             timings[name] = report(name, measure(scene, run_ours(scene, "cpu", threads), repeats))
     chosen = kernel_backend.open_build(next(iter(usable_builds())))
-    kernel_backend.load_kernel = lambda: chosen  # type: ignore[assignment,misc]
+    kernel_backend.load_kernel = lambda: chosen  # type: ignore[assignment]
     return timings
 
 

@@ -267,8 +267,10 @@ def write_photo(photo: Photo, folder: Path, stem: str) -> Path:
     if photo.exif:
         block[_MAKE], block[_MODEL] = "Maker", "Phone 1"
         block.get_ifd(_EXIF_IFD).update(dict(photo.exif))
-    options = {"quality": photo.quality} if photo.suffix == ".jpg" else {}
-    picture.save(path, **options, **({"exif": block.tobytes()} if photo.exif else {}))
+    options: dict[str, Any] = {"quality": photo.quality} if photo.suffix == ".jpg" else {}
+    if photo.exif:
+        options["exif"] = block.tobytes()
+    picture.save(path, **options)
     return path
 
 

@@ -65,7 +65,7 @@ def main() -> None:
     def backward(everything: bool) -> None:
         model.zero_grad(set_to_none=True)
         if not everything:
-            torch.stack([tokens.mean() for tokens in model.encode(images).collected]).sum().backward()
+            torch.stack([tokens.mean() for tokens in model.encode(images).collected]).sum().backward()  # type: ignore[no-untyped-call]
             return
         out = model(images)
         maps = (
@@ -79,7 +79,7 @@ def main() -> None:
         )
         merged = out.gaussians.merged[0]
         splats = (merged.means, merged.quat_wxyz, merged.scales, merged.opacities, merged.sh, out.cameras.vector)
-        torch.stack([value.mean() for value in (*maps, *splats)]).sum().backward()
+        torch.stack([value.mean() for value in (*maps, *splats)]).sum().backward()  # type: ignore[no-untyped-call]
 
     print(
         f"torch {torch.__version__}, 1 thread, float32, {count:,} parameters, {VIEWS} views {HEIGHT}x{WIDTH}; CPU seconds"

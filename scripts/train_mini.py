@@ -134,7 +134,7 @@ def export(config: DictConfig) -> None:
     logging.info("step %d, %.0f minutes -> %s", trainer.step, trainer.seconds / 60, config.export_to)
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="train_mini")
+@hydra.main(version_base="1.3", config_path="../conf", config_name="train_mini")  # type: ignore[untyped-decorator]
 @entry_point
 def main(config: DictConfig) -> None:
     """Entry point."""

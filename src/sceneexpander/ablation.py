@@ -1,9 +1,9 @@
-"""The ablation with known truth: ``python -m sceneexpander.ablation [options] [key=value ...]``.
+"""The ablation with known truth: ``sceneexpander ablation [options] [key=value ...]``.
 
 Measures the studies of `sceneexpander.expandbench.studies` and writes results/ablation.json and docs/ablation.md from them; with rows,
 scenes, grades or seeds given, a table of one's own. Rows are the overlays of ``conf/ablation``. Finished cells are kept in
 ``.cache/expandbench``, so the command continues where it was stopped, and another choice of rows reuses what is there.
-(``python -m sceneexpander.sweep --multirun ablation=...`` runs the same rows as whole pipelines on the scenes of params.yaml.)
+(``sceneexpander sweep --multirun ablation=...`` runs the same rows as whole pipelines on the scenes of params.yaml.)
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
+from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
@@ -38,10 +39,16 @@ RENAMED = {"control_no_adaptation": "corrected"}
 OWN_TABLE = ("scenes", "grades", "rows", "seeds")
 
 
-def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
-    """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m sceneexpander.ablation", description=__doc__.splitlines()[0])
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="for every row, e.g. adapt.steps=60")
+def make_parser() -> CommandParser:
+    """The options of the command."""
+    parser = CommandParser(
+        "ablation",
+        "Measure what each part of the method does, on procedural worlds whose cameras and depths are known.",
+        examples=["", "--study rows,long", "--finished", "--rows full,none --grades mixed_2 --seeds 0 adapt.steps=60"],
+    )
+    parser.add_argument(
+        "overrides", nargs="*", metavar="key=value", default=[], help="for every row, e.g. adapt.steps=60"
+    )
     parser.add_argument(
         "--study", help=f"comma-separated of {', '.join(study.name for study in STUDIES)}; default: all of them"
     )
@@ -59,7 +66,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--finished", action="store_true", help="run nothing: tables of the cells that are there")
     own.add_argument("--out", type=Path, help="without suffix; default: .cache/expandbench/table in the project")
-    return parser.parse_args(given)
+    return parser
 
 
 def make_plan(
@@ -106,9 +113,9 @@ def code_of(project: Path) -> str:
 
 
 @entry_point
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure the studies and write the page about them, or measure and print a table of one's own."""
-    options = arguments()
+    options = make_parser().parse_intermixed_args(arguments)
     project = find_project()
     if any(getattr(options, name) is not None for name in OWN_TABLE):
         if options.study is not None:

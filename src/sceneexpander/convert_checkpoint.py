@@ -1,4 +1,4 @@
-"""``python -m sceneexpander.convert_checkpoint IN.pt OUT.safetensors``: PyTorch checkpoints without running their code.
+"""``sceneexpander convert IN.pt OUT.safetensors``: PyTorch checkpoints without running their code.
 
 A ``.pt``/``.pth``/``.ckpt``/``.bin`` file is a zip archive with a pickle, and a pickle is a program. This reader never hands it to
 ``torch.load``: its own unpickler knows a closed list of names (tensor rebuilding, storages, ordered dictionaries), all of them bound to
@@ -10,7 +10,6 @@ second closed list has their names; all of them stand for an object that holds n
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import math
@@ -31,6 +30,7 @@ from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
+from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import UserError, entry_point
 from sceneexpander.typed import REFUSALS, describe, shorten
 
@@ -402,17 +402,23 @@ def _writing(target: Path) -> Iterator[None]:
         raise UserError(problem, where=shorten(str(target), 300), fix="choose another output name") from None
 
 
-@entry_point
-def main(arguments: list[str] | None = None) -> int:
-    """Convert one file."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sceneexpander.convert_checkpoint",
-        description="Convert a PyTorch checkpoint of plain tensors to safetensors without running any code in it.",
+def make_parser() -> CommandParser:
+    """The options of the command."""
+    parser = CommandParser(
+        "convert",
+        "Convert a PyTorch checkpoint of plain tensors to safetensors without running any code in it.",
+        examples=["model.pt model.safetensors", "checkpoint.pth model.safetensors --key model"],
     )
     parser.add_argument("source", type=Path, help=".pt, .pth, .ckpt or .bin file")
     parser.add_argument("target", type=Path, help=".safetensors file to write")
     parser.add_argument("--key", help="entry of the checkpoint that holds the weights (default: found automatically)")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+@entry_point
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Convert one file."""
+    options = make_parser().parse_args(arguments)
     count = convert(options.source, options.target, key=options.key)
     print(f"{count} tensors -> {options.target}")
     return 0

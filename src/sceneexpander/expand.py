@@ -1,4 +1,4 @@
-"""Your own photos, one command: ``python -m sceneexpander.expand PHOTOS --inserted PICTURE --prompt "..."``.
+"""Your own photos, one command: ``sceneexpander expand PHOTOS --inserted PICTURE --prompt "..."``.
 
 ``PHOTOS`` is a folder of photos, or a scene folder with a ``scene.yaml``. Runs unattended in ``runs/NAME`` and prints where the report is.
 Methods and settings are those of the project's params.yaml; ``key=value`` adds to them.
@@ -6,7 +6,6 @@ Methods and settings are those of the project's params.yaml; ``key=value`` adds 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -17,11 +16,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import yaml
 
 from sceneexpander.artifacts.store import write_bytes_atomic
+from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
@@ -36,7 +36,6 @@ from sceneexpander.report.cameras import camera_lines
 from sceneexpander.selection import Selection, check_name, read_selection
 from sceneexpander.workspace import make_workspace, merged_overrides, remove_tree, reproduce, run_lock
 
-_USAGE = 'python -m sceneexpander.expand PHOTOS --inserted PICTURE --prompt "..." (--help tells the rest)'
 SCENE_FILE = "scene.yaml"
 SOURCE_FILE = "source.json"  # in a run's folder: which photos it is of
 
@@ -54,25 +53,34 @@ class Request:
     overrides: tuple[str, ...] = ()
 
 
-class _Parser(argparse.ArgumentParser):
-    """Errors are one line like all others."""
-
-    def error(self, message: str) -> NoReturn:
-        # argparse counts any number of settings as something that is required, even though it may be none.
-        raise UserError(message.replace("photos, overrides", "PHOTOS"), where="expand", fix=_USAGE)
-
-
-def parse_arguments(arguments: Sequence[str]) -> Request:
-    """The command line as a `Request`."""
-    parser = _Parser(prog="python -m sceneexpander.expand", description=__doc__)
-    parser.add_argument("photos", type=Path, help="folder of photos, or a scene folder with scene.yaml")
+def make_parser() -> CommandParser:
+    """The options of the command."""
+    parser = CommandParser(
+        "expand",
+        "Expand the scene of your own photos. Methods and settings are those of the project's params.yaml; key=value adds to them.",
+        examples=[
+            '~/pictures/terrace --inserted bench.png --prompt "Behind the white table is a wooden bench."',
+            "~/scenes/terrace --name try_2 profile=smoke adapt.steps=50",
+        ],
+    )
+    parser.add_argument(
+        "photos", type=Path, metavar="PHOTOS", help="folder of photos, or a scene folder with scene.yaml"
+    )
     parser.add_argument("--inserted", type=Path, action="append", default=[], help="picture to insert, one per round")
     parser.add_argument("--prompt", action="append", default=[], help="what to add, one per round")
     parser.add_argument("--motion", action="append", default=[], help="camera motion, e.g. 'turn right'")
     parser.add_argument("--object", action="append", default=[], help="new object, e.g. 'a wooden bench'")
     parser.add_argument("--name", help="name of the run (default: the folder's)")
-    parser.add_argument("overrides", nargs="*", help="configuration, e.g. profile=smoke adapt.steps=50")
-    given = parser.parse_intermixed_args(list(arguments))
+    # No default: argparse would count settings, of which there may be none, among the arguments that are missing.
+    parser.add_argument(
+        "overrides", nargs="*", metavar="key=value", default=[], help="configuration, e.g. profile=smoke"
+    )
+    return parser
+
+
+def parse_arguments(arguments: Sequence[str]) -> Request:
+    """The command line as a `Request`."""
+    given = make_parser().parse_intermixed_args(list(arguments))
     for override in given.overrides:
         if "=" not in override:
             raise UserError("is not a setting", where=override, fix="write key=value, e.g. profile=smoke")
@@ -262,9 +270,9 @@ def _shown_as_given(scene: Path, request: Request) -> Iterator[None]:
 
 
 @entry_point
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    request = parse_arguments(sys.argv[1:])
+    request = parse_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
         with ended_by_signals():
             page = expand(request, project=find_project())

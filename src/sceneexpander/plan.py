@@ -1,26 +1,14 @@
-"""``python -m sceneexpander.plan KEY=VALUE...``: memory and operations of an adaptation, without a GPU and without weights.
-
-    model=worldmirror/large   or worldmirror/mid, worldmirror/tiny, mini
-    views=9                   all views, the inserted one included; at most 64
-    width=518 height=518      pixels, at most 4096; the height is the width unless given
-    options=gpu24             a profile of conf/profile (gpu24 is made for 24 GB), or `paper`: the plain way to run the method
-    tflops=60                 what the device really reaches; gives times
-    adapt.KEY=VALUE           any key of conf/adapt
-    --json                    one object instead of text
-
-Memory is that of tensors, in units of 10^9 bytes: a GPU's runtime takes up to one more. A step is planned at the largest batch
-that the configuration can draw.
-"""
+"""``sceneexpander plan KEY=VALUE...``: memory and operations of an adaptation, without a GPU and without weights."""
 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from sceneexpander.adaptation.config import AdaptConfig, EngineConfig, Precision
+from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.errors import UserError, did_you_mean, entry_point
@@ -30,13 +18,24 @@ from sceneexpander.project import find_project
 from sceneexpander.typed import shorten
 
 KEYS = ("model", "views", "width", "height", "options", "tflops")
-FLAGS = ("--json", "--help")
 PAPER = "paper"
 MAX_VIEWS = 64  # a plan takes about a second of one core for each
 MAX_SIDE = 4096
 MAX_TFLOPS = 1_000_000
 MAX_DIGITS = 10
 GIGA = 1e9
+HELP = """Memory and operations of an adaptation, without a GPU and without weights. Settings:
+
+    model=worldmirror/large   or worldmirror/mid, worldmirror/tiny, mini
+    views=9                   all views, the inserted one included; at most 64
+    width=518 height=518      pixels, at most 4096; the height is the width unless given
+    options=gpu24             a profile of conf/profile (gpu24 is made for 24 GB), or `paper`: the plain way to run the method
+    tflops=60                 what the device really reaches; gives times
+    adapt.KEY=VALUE           any key of conf/adapt
+
+Memory is that of tensors, in units of 10^9 bytes: a GPU's runtime takes up to one more. A step is planned at the largest batch
+that the configuration can draw.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,20 +183,28 @@ def text(plan: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def make_parser() -> CommandParser:
+    """The options of the command."""
+    parser = CommandParser(
+        "plan",
+        HELP,
+        examples=[
+            "model=worldmirror/large views=9 width=518",
+            "model=worldmirror/large views=9 width=518 options=paper --json",
+            "model=mini views=9 width=336 height=252 options=cpu tflops=0.05 adapt.steps=200",
+        ],
+    )
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", default=[], help="see above")
+    parser.add_argument("--json", action="store_true", help="one object instead of text")
+    return parser
+
+
 @entry_point
 def main(arguments: Sequence[str] | None = None) -> None:
     """Answer the question on the command line."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    flags = [argument for argument in given if argument.startswith("-")]
-    for flag in flags:
-        if flag not in FLAGS:
-            raise UserError("unknown option", where=flag, fix=did_you_mean(flag, FLAGS))
-    if "--help" in flags:
-        print(__doc__)
-        return
-    question = parse([argument for argument in given if not argument.startswith("-")])
-    plan = answer(question)
-    print(json.dumps(plan, indent=1) if "--json" in flags else text(plan))
+    given = make_parser().parse_intermixed_args(arguments)
+    plan = answer(parse(given.settings))
+    print(json.dumps(plan, indent=1) if given.json else text(plan))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Many configurations at once: ``python -m sceneexpander.sweep --multirun ablation=baseline,anchor,full``.
+"""Many configurations at once: ``sceneexpander sweep --multirun ablation=baseline,anchor,full``.
 
 Each combination runs as its own workspace; what they have in common runs once. ``scene=a,b`` or ``scene=glob(*)`` makes jobs over
 folders of ``scenes/``; without it the scenes are those of params.yaml, and so are rounds and methods in any case.
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose, scene_option
 from sceneexpander.config.overrides import environment_hidden, key_of, written_out
 from sceneexpander.config.parse import ConfigError
@@ -112,9 +113,7 @@ def check_axes(arguments: Sequence[str], project: Path) -> Axes:
     known = ("--multirun", "-m")
     for option in options:
         if option not in known:
-            raise UserError(
-                f"unknown option {option!r}", where="sceneexpander.sweep", fix=did_you_mean(option, known[:1])
-            )
+            raise UserError("unknown option", where=shorten(option), fix=did_you_mean(shorten(option), known[:1]))
     given = [item for item in arguments if not item.startswith("-")]
     for item in given:
         if "=" not in item and not item.startswith("~"):
@@ -243,7 +242,7 @@ def _axes(items: Sequence[str], conf: Path) -> dict[str, list[str]]:
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         at_fault = next((text for text in own if key_of(text) in str(error)), None)
         fix = None if at_fault is None else _hydra_fix(at_fault, conf)
-        where = shorten(at_fault or item) or "sceneexpander.sweep"
+        where = shorten(at_fault or item) or "sceneexpander sweep"
         raise UserError(shorten(first.strip(), 200), where=where, fix=fix) from None
     return found
 
@@ -323,25 +322,47 @@ def run_hydra(arguments: Sequence[str], project: Path) -> None:
         if disk_full(error) is not None:
             raise
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise UserError(first.strip(), where="sceneexpander.sweep") from None
+        raise UserError(first.strip(), where="sceneexpander sweep") from None
+
+
+def make_parser() -> CommandParser:
+    """The options of the command. What they mean is Hydra's grammar, which `check_axes` reads."""
+    parser = CommandParser(
+        "sweep",
+        "Run the pipeline for every combination of settings. Each is a workspace of its own; what they have in common runs once.",
+        examples=[
+            "--multirun ablation=baseline,full seed=0,1,2",
+            "--multirun 'scene=glob(*)' profile=smoke",
+            "--multirun hydra/launcher=slurm 'ablation=glob(*)'",
+        ],
+    )
+    parser.add_argument(
+        "axes", nargs="+", metavar="key=value,...", help="settings, with several values those to combine"
+    )
+    parser.add_argument("-m", "--multirun", action="store_true", help="some settings have several values")
+    return parser
 
 
 @entry_point
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Check the axes, then run the jobs."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if {"-h", "--help"} & set(given):
+        make_parser().print_help()
+        return
     project = find_project()
     if os.environ.pop(INNER_ENV, None):
         try:
-            run_hydra(sys.argv[1:], project)
+            run_hydra(given, project)
         except RuntimeError as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(1) from None
         return
-    if not sys.argv[1:]:
+    if not given:
         raise UserError(
-            "nothing to sweep over", where="sceneexpander.sweep", fix="add --multirun ablation=baseline,full"
+            "nothing to sweep over", where="sceneexpander sweep", fix="add --multirun ablation=baseline,full"
         )
-    axes = check_axes(sys.argv[1:], project)
+    axes = check_axes(given, project)
     check_inputs(axes.jobs, project)
     # Jobs run in processes of their own, some of which Hydra's launchers do not end: they end with this one.
     command = [sys.executable, "-m", "sceneexpander.sweep", *axes.arguments]

@@ -1,12 +1,13 @@
-"""``python -m sceneexpander.ui``: MLflow's interface over the local store, on loopback only; running adaptations show live."""
+"""``sceneexpander ui``: MLflow's interface over the local store, on loopback only; running adaptations show live."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import socket
 import sys
+from collections.abc import Sequence
 
+from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import UserError, entry_point
 from sceneexpander.processes import ended_by_signals, kept
 from sceneexpander.project import LIVE_FOLDER, find_project
@@ -25,12 +26,18 @@ from sceneexpander.tracking.store import (
 HOST = "127.0.0.1"
 
 
+def make_parser() -> CommandParser:
+    """The options of the command."""
+    description = "MLflow's interface over the local store, on this machine only; running adaptations show live."
+    parser = CommandParser("ui", description, examples=["", "--port 5001"])
+    parser.add_argument("--port", type=int, default=5000, help="default: 5000")
+    return parser
+
+
 @entry_point
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Start the server and print links that open the numbers, the charts and the pictures. What it starts ends with it, however it ends."""
-    parser = argparse.ArgumentParser(prog="python -m sceneexpander.ui", description=__doc__)
-    parser.add_argument("--port", type=int, default=5000)
-    port = parser.parse_args().port
+    port = make_parser().parse_args(arguments).port
     check_port(port)
     root = find_project()
     quiet_environment()

@@ -143,7 +143,7 @@ def _refined(
     cam_from_world = rigid_inverse(poses[-1])
     before = _cost(points, colours, cam_from_world, intrinsics[-1], inserted)
     for blur in _BLURS_PX:
-        blurred = _blurred(inserted, blur)
+        blurred = _blur_picture(inserted, blur)
         for _ in range(_STEPS):
             cam_from_world = _gauss_newton(points, colours, cam_from_world, intrinsics[-1], blurred)
     after = _cost(points, colours, cam_from_world, intrinsics[-1], inserted)
@@ -238,14 +238,12 @@ def _moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:
     return torch.linalg.matrix_exp(generator) @ cam_from_world
 
 
-def _blurred(picture: Tensor, sigma: float) -> Tensor:
-    reach = int(3 * sigma) + 1
-    offsets = torch.arange(-reach, reach + 1, dtype=picture.dtype, device=picture.device)
-    kernel = torch.exp(-(offsets**2) / (2 * sigma**2))
-    kernel = kernel / kernel.sum()
-    padded = torch.nn.functional.pad(picture[:, None], (reach, reach, reach, reach), mode="replicate")
-    rows = torch.nn.functional.conv2d(padded, kernel[None, None, :, None])
-    return torch.nn.functional.conv2d(rows, kernel[None, None, None, :])[:, 0]
+def _blur_picture(picture: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur of a (3,H,W) picture whose border is repeated."""
+    from kornia.filters import gaussian_blur2d  # takes as long to import as torch
+
+    size = 2 * (int(3 * sigma) + 1) + 1
+    return gaussian_blur2d(picture[None], (size, size), (sigma, sigma), border_type="replicate")[0]
 
 
 def _depth_factor(points: Tensor, cam_from_world: Tensor, intrinsics: Tensor, depth: Tensor) -> float:

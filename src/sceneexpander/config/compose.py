@@ -104,7 +104,7 @@ def check_override(conf: Path, text: str) -> bool:
             reason = str(error).partition("See https://hydra.cc")[0]
         raise ConfigError(f"is no KEY=VALUE ({shorten(reason, 120)})", where=where, fix="put texts in quotes") from None
     if override.is_sweep_override():
-        raise ConfigError("holds several values", where=where, fix="give one, or use sceneexpander.sweep")
+        raise ConfigError("holds several values", where=where, fix="give one, or use sceneexpander sweep")
     group = override.key_or_group
     options = options_of(conf, group)
     if not options or override.is_delete():

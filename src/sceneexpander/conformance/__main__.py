@@ -1,4 +1,4 @@
-"""``python -m sceneexpander.conformance CASE [CASE...]`` and ``--keys FILE.keys.json``.
+"""``sceneexpander conformance CASE [CASE...]`` and ``--keys FILE.keys.json``.
 
 Prints one line per output with its largest error, in units of its tolerance. Exit code 0: everything agrees; 1: something does
 not; 2: a case is unknown, missing or damaged.
@@ -6,12 +6,12 @@ not; 2: a case is unknown, missing or damaged.
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import UserError, entry_point
 
 if TYPE_CHECKING:
@@ -20,10 +20,12 @@ if TYPE_CHECKING:
 EXIT_DISAGREES = 1
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m sceneexpander.conformance",
-        description="Compare this implementation with recorded outputs of reference implementations.",
+def make_parser() -> CommandParser:
+    """The options of the command."""
+    parser = CommandParser(
+        "conformance",
+        "Compare this implementation with recorded outputs of reference implementations. Exit code 1: something disagrees.",
+        examples=["cases/worldmirror cases/ttt3r", "--keys worldmirror.keys.json"],
     )
     parser.add_argument(
         "cases", nargs="*", type=Path, help="case folders, folders of cases, or rasterisation case files"
@@ -35,12 +37,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 @entry_point
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the cases and return the exit code."""
     from sceneexpander.conformance.keys import check_keys
     from sceneexpander.conformance.registry import find_cases
 
-    options = _parser().parse_args(arguments)
+    options = make_parser().parse_args(arguments)
     if not options.cases and not options.keys:
         raise UserError("nothing to check", fix="give case folders, or --keys FILE.keys.json")
     # Everything is found before anything runs, so that a typo does not cost the time of the cases before it.

@@ -126,7 +126,7 @@ make ablation                                              # all studies below; 
 make ablation ARGS="--study rows,long"                     # some of them
 make ablation ARGS="--finished"                            # nothing is run: the page from the cells that are there
 make ablation ARGS="--rows full,none --grades mixed_2 --seeds 0"   # a table of your own, this page is left alone
-python -m sceneexpander.sweep --multirun ablation=baseline,full,none seed=0,1,2    # rows as whole pipelines
+sceneexpander sweep --multirun ablation=baseline,full,none seed=0,1,2    # rows as whole pipelines
 python scripts/real_ablation.py FOLDER ... --rows full,none                        # on scene folders without truth
 ```
 

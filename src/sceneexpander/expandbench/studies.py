@@ -1,4 +1,4 @@
-"""What `docs/ablation.md` holds: which rows are measured where. One command measures all of it (``python -m sceneexpander.ablation``)."""
+"""What `docs/ablation.md` holds: which rows are measured where. One command measures all of it (``sceneexpander ablation``)."""
 
 from __future__ import annotations
 

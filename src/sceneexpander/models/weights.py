@@ -1,7 +1,7 @@
 """Where weights come from, and loading them strictly.
 
 A weights spec is ``builtin`` (shipped with the package), a local ``.safetensors`` path, or a hub id ``org/name@revision``.
-Only safetensors is ever read: other formats go through ``python -m sceneexpander.convert_checkpoint`` once.
+Only safetensors is ever read: other formats go through ``sceneexpander convert`` once.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def check_safetensors(path: Path) -> None:
         start = file.read(8)
         header_bytes = int.from_bytes(start, "little")
         if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
-            fix = "convert it once: python -m sceneexpander.convert_checkpoint IN OUT.safetensors"
+            fix = "convert it once: sceneexpander convert IN OUT.safetensors"
             raise UserError("is a PyTorch checkpoint, not a safetensors file", where=path, fix=fix)
         if len(start) < 8 or not 2 <= header_bytes <= MAX_HEADER_BYTES:
             raise UserError("is not a safetensors file", where=path, fix="expected an 8-byte header length first")

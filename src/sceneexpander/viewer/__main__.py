@@ -1,9 +1,9 @@
-"""``python -m sceneexpander.viewer outputs/<scene>``: walk through the scene of a round in the browser, on this machine only."""
+"""``sceneexpander view outputs/<scene>``: walk through the scene of a round in the browser, on this machine only."""
 
 from __future__ import annotations
 
-import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from torch import Tensor
@@ -12,6 +12,7 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.unavailable import unavailable_in
+from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import UserError, entry_point
 from sceneexpander.viewer.gate import check_authority
 from sceneexpander.viewer.live import HOST, LiveViewer
@@ -61,10 +62,17 @@ def load_round(folder: Path, number: int) -> tuple[str, list[Reconstruction], di
     return scene.name, [Reconstruction.load(path) for path in found], pictures
 
 
-@entry_point
-def main() -> None:
-    """Serve until interrupted."""
-    parser = argparse.ArgumentParser(prog="python -m sceneexpander.viewer", description=__doc__)
+def make_parser() -> CommandParser:
+    """The options of the command."""
+    parser = CommandParser(
+        "view",
+        "Walk through the scene of a round in the browser, on this machine only.",
+        examples=[
+            "outputs/courtyard",
+            "outputs/courtyard --round 2 --limit 50000",
+            "outputs/a --allow-host localhost:9000",
+        ],
+    )
     parser.add_argument("folder", type=Path, help="outputs/<scene>")
     parser.add_argument("--round", type=int, default=1)
     parser.add_argument("--port", type=int, default=8080)
@@ -76,14 +84,20 @@ def main() -> None:
         metavar="NAME[:PORT]",
         help="answer to this name too, as the address bar shows it behind a tunnel or a proxy; may be repeated",
     )
-    arguments = parser.parse_args()
-    if arguments.limit < 1:
-        raise UserError(f"must be at least 1, is {arguments.limit}", where="--limit")
-    if not 0 <= arguments.port <= LAST_PORT:
-        raise UserError(f"is {arguments.port}, must be from 0 to {LAST_PORT}", where="--port")
-    hosts = [check_authority(name) for name in arguments.allow_host]
-    title, reconstructions, pictures = load_round(arguments.folder, arguments.round)
-    viewer = LiveViewer(reconstructions, pictures, title=title, port=arguments.port, limit=arguments.limit, hosts=hosts)
+    return parser
+
+
+@entry_point
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Serve until interrupted."""
+    given = make_parser().parse_args(arguments)
+    if given.limit < 1:
+        raise UserError(f"must be at least 1, is {given.limit}", where="--limit")
+    if not 0 <= given.port <= LAST_PORT:
+        raise UserError(f"is {given.port}, must be from 0 to {LAST_PORT}", where="--port")
+    hosts = [check_authority(name) for name in given.allow_host]
+    title, reconstructions, pictures = load_round(given.folder, given.round)
+    viewer = LiveViewer(reconstructions, pictures, title=title, port=given.port, limit=given.limit, hosts=hosts)
     print(f"viewer: http://{HOST}:{viewer.port} (stop with Ctrl-C)", flush=True)
     try:
         viewer.serve()

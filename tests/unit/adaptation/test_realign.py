@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+import scipy.ndimage
 import torch
 
 from sceneexpander.adaptation.config import Realign
-from sceneexpander.adaptation.realign import RealignReport, realign
+from sceneexpander.adaptation.realign import _BLURS_PX, RealignReport, _blur_picture, realign
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.geometry.rigid import rotation_angle_deg
@@ -108,3 +110,13 @@ def test_refine_leaves_a_view_without_a_pose_alone(world) -> None:
     held, report = run(world, unposed, Realign.REFINE)
     assert report is None
     assert torch.allclose(held.world_from_cam[-1], wrong.world_from_cam[-1], atol=1e-4)
+
+
+@pytest.mark.parametrize("sigma", _BLURS_PX)
+def test_the_blur_is_the_gaussian_of_its_width_with_the_border_repeated(sigma: float) -> None:
+    picture = torch.rand(3, 40, 52, generator=torch.Generator().manual_seed(0))
+    radius = int(3 * sigma) + 1
+    expected = [
+        scipy.ndimage.gaussian_filter(channel, sigma, mode="nearest", radius=radius) for channel in picture.numpy()
+    ]
+    torch.testing.assert_close(_blur_picture(picture, sigma), torch.from_numpy(np.stack(expected)), atol=1e-5, rtol=0)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import fields
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 import yaml
 
+from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.packages import LOCKS
 from stages import layout
 from stages.fingerprint import stage_names
@@ -147,3 +149,17 @@ def test_selected_methods_exist() -> None:
     assert PIPELINE["rival"]["matrix"]["method"] == list(layout.RIVALS)
     assert PIPELINE["optimise"]["matrix"]["method"] == list(layout.OPTIMISABLE)
     assert [item["prev"] for item in params["rounds"]] == [item["k"] - 1 for item in params["rounds"]]
+
+
+def test_no_setting_has_a_name_that_the_cache_ignores() -> None:
+    """DVC compares outputs and parameters without keys of its own bookkeeping."""
+
+    def keys(schema: Any) -> Iterator[str]:
+        for name, hint in get_type_hints(schema).items():
+            yield name
+            if is_dataclass(hint):
+                yield from keys(hint)
+
+    found = set(keys(ProjectConfig))
+    assert {"steps", "long_side_px"} <= found
+    assert not found & {"size", "nfiles"}

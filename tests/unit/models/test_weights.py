@@ -102,7 +102,7 @@ def test_other_formats_are_refused(tmp_path: Path, content: bytes) -> None:
 def test_a_renamed_pytorch_checkpoint_points_to_the_converter(tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
     torch.save(layer().state_dict(), path)
-    with pytest.raises(UserError, match="convert_checkpoint"):
+    with pytest.raises(UserError, match="sceneexpander convert"):
         read_tensors(path)
 
 

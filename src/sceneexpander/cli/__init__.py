@@ -1,0 +1,1 @@
+"""What people type: ``sceneexpander COMMAND``. Nothing heavy is imported before a command is known."""

@@ -1,0 +1,43 @@
+"""The commands. A module of a command has ``make_parser()`` and ``main(arguments)``; it is imported when it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One word after ``sceneexpander``.
+
+    Attributes:
+        name: the word.
+        module: where its ``make_parser`` and ``main`` are.
+        summary: one line for the list of commands.
+    """
+
+    name: str
+    module: str
+    summary: str
+
+
+COMMANDS = (
+    Command("expand", "sceneexpander.expand", "expand the scene of a folder of photos by a picture and a sentence"),
+    Command("sweep", "sceneexpander.sweep", "run the pipeline for many combinations of settings"),
+    Command("ablation", "sceneexpander.ablation", "measure what each part of the method does, against known truth"),
+    Command("plan", "sceneexpander.plan", "tell memory and operations in advance, without a GPU or weights"),
+    Command("view", "sceneexpander.viewer.__main__", "walk through a reconstructed scene in the browser"),
+    Command("ui", "sceneexpander.ui", "open all recorded runs in the browser, running ones live"),
+    Command("follow", "sceneexpander.follow", "mirror running adaptations into MLflow without the browser"),
+    Command(
+        "conformance",
+        "sceneexpander.conformance.__main__",
+        "compare with recorded outputs of reference implementations",
+    ),
+    Command(
+        "convert", "sceneexpander.convert_checkpoint", "convert a PyTorch checkpoint to safetensors, running no code"
+    ),
+    Command("check", "sceneexpander.cli.check", "look at params.yaml, conf/, photos and weights; run nothing"),
+    Command(
+        "completion", "sceneexpander.cli.completion", "print a script that completes commands in bash, zsh or tcsh"
+    ),
+)
