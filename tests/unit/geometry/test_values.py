@@ -43,30 +43,33 @@ def poses(count: int) -> torch.Tensor:
     return rigid_from_parts(rotation_from_quat_wxyz(quat), torch.randn(count, 3, generator=g, dtype=torch.float64))
 
 
+ROWS = tuple(field.name for field in fields(Gaussians) if isinstance(getattr(gaussians(1), field.name), torch.Tensor))
+
+
 @pytest.mark.parametrize("pick", [torch.tensor([4, 0, 2]), torch.tensor([True, False, True, True, False])])
 def test_selection_takes_the_same_rows_of_everything(pick: torch.Tensor) -> None:
     whole = gaussians(5)
     part = whole.select(pick)
     assert len(part) == 3
     assert len(whole) == 5
-    for field in fields(Gaussians):
-        assert torch.equal(getattr(part, field.name), getattr(whole, field.name)[pick])
+    for name in ROWS:
+        assert torch.equal(getattr(part, name), getattr(whole, name)[pick])
 
 
 def test_parts_together_are_the_whole_in_order() -> None:
     whole = gaussians(6)
     again = concatenate([whole.select(torch.arange(2)), whole.select(torch.arange(2, 6))])
-    for field in fields(Gaussians):
-        assert torch.equal(getattr(again, field.name), getattr(whole, field.name))
+    for name in ROWS:
+        assert torch.equal(getattr(again, name), getattr(whole, name))
     with pytest.raises(ValueError, match="at least one"):
         concatenate([])
 
 
 def test_rows_must_belong_together() -> None:
-    for field in fields(Gaussians):
-        value = getattr(gaussians(4), field.name)
+    for name in ROWS:
+        value = getattr(gaussians(4), name)
         with pytest.raises(ValueError, match="rows"):
-            replace(gaussians(4), **{field.name: value[:3]})
+            replace(gaussians(4), **{name: value[:3]})
 
 
 def test_detached_values_have_no_history() -> None:
