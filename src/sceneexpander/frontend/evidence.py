@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sceneexpander.frontend.bundle import LENS_PARAMETERS, LOG_FOCAL, SHIFT_X, SHIFT_Y
-from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, OtherView, held_lens
+from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, OtherView, freedom_of, held_lens
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.rival_poses import direction_changes_deg, largest_rival_angle_deg
@@ -43,8 +43,9 @@ class ViewEvidence:
         lens_sigma_deg: how far the directions to the others move if its focal, or its centre if it was cropped, is off by as much as
             pictures alone leave it uncertain; 0 where they are shared or known from elsewhere.
         rival_angle_deg: how far the directions to the others move if it stood where a flat surface would look the same; 0 where relief
-            rules that out.
-        spread_deg: how far the directions to the others move to cameras of another focal that explain the photos about as well.
+            or a third view rules that out.
+        spread_deg: how far the directions to the others move to cameras of another focal, or of another centre for a part cut out of a
+            photo, that explain the photos about as well.
     """
 
     agreeing: float
@@ -83,7 +84,7 @@ class ViewEvidence:
             )
         if self.spread_deg > config.max_spread_deg:
             return (
-                "cameras with another focal explain the photos about as well:"
+                "other cameras explain the photos about as well:"
                 f" its direction may be off by {self.spread_deg:.0f} degrees"
             )
         return ""
@@ -115,7 +116,7 @@ def weigh_evidence(
                 mapping, view, features, pairs, _own_parameters(mapping, view, hinted=hinted[view])
             ),
             rival_angle_deg=_rival_angle_deg(mapping, view, features, pairs),
-            spread_deg=float(mapping.spread_deg[view]),
+            spread_deg=max(float(mapping.spread_deg[view]), _crop_spread_deg(mapping, view, features, pairs)),
         )
     return found
 
@@ -208,8 +209,8 @@ def _lens_sigma_deg(
 
 
 def _rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
-    others = other_views(mapping, view, features, pairs)
-    if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
+    others = [other for other in other_views(mapping, view, features, pairs) if len(other.own_xy) >= _MIN_MATCHES]
+    if len(others) != 1:  # from a third place a flat surface looks different
         return 0.0
     fit, best = _own_fit(mapping, view, others)
     return largest_rival_angle_deg(
@@ -221,6 +222,27 @@ def _rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], 
         still_fits=_STILL_FITS,
         seed=mapping.seed,
     )
+
+
+def _crop_spread_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
+    """How far directions move if a view that has the others' focal in original pixels, but not their size, was cut out off the centre."""
+    crop, lens = mapping.crops.get(view), int(mapping.lens_of[view])
+    if crop is None or mapping.lenses.free[lens, SHIFT_X] or mapping.lenses.offset[lens] != crop.log_focal:
+        return 0.0
+    others = other_views(mapping, view, features, pairs)
+    if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
+        return 0.0
+    fit, best = _own_fit(mapping, view, others)
+    limits = {SHIFT_X: crop.limit_x, SHIFT_Y: crop.limit_y}
+    worst = 0.0
+    for corner in ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)):
+        begun = best.lens.copy()
+        begun[SHIFT_X : SHIFT_Y + 1] = np.multiply(corner, list(limits.values()))
+        shift = {parameter: (-limit, limit, np.inf) for parameter, limit in limits.items()}
+        other = fit.refine(best.rotation, best.translation, begun, freedom_of(shift, begun))
+        if other.cost < _STILL_FITS * best.cost:
+            worst = max(worst, float(np.median(direction_changes_deg(best, other, others))))
+    return worst
 
 
 def _own_fit(mapping: Mapping, view: int, others: Sequence[OtherView]) -> tuple[EpipolarFit, EpipolarView]:
