@@ -9,7 +9,7 @@ from sceneexpander.fingerprint import SourceTree
 from stages import layout
 from stages.runner import Cell, stage
 
-NOT_STAGES = frozenset({"__init__", "layout", "runner", "fingerprint", "check"})
+NOT_STAGES = frozenset({"__init__", "layout", "runner", "rounds", "fingerprint", "check"})
 
 
 def stage_names(folder: Path) -> list[str]:

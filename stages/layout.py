@@ -57,6 +57,11 @@ def repeat_name(repeat: int) -> str:
     return REPEATS.replace("*", str(repeat)) if repeat else "reconstruction"
 
 
+def candidates(scene: str, number: int) -> Path:
+    """The `CandidateSet` of a round."""
+    return round_folder(scene, number) / "candidates"
+
+
 def inserted(scene: str, number: int) -> Path:
     """The `InsertedView` of a round."""
     return round_folder(scene, number) / "inserted"

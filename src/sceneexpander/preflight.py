@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from sceneexpander.config.compose import compose, scene_option
@@ -14,12 +14,28 @@ from sceneexpander.errors import UserError
 from sceneexpander.evaluation import check_truth
 from sceneexpander.evaluation.image import WINDOW
 from sceneexpander.expansion import ModelConfig, load_model
-from sceneexpander.generation import generate_inserted_view
+from sceneexpander.generation import Forecast, GenerationContext, check_round
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
 from sceneexpander.models.weights import HUB_ID
+from sceneexpander.project import GENERATED_FOLDER, find_project
 
-CHECKED_SECTIONS = ("seed", "scene", "generator", "model", "rivals")  # of the configuration, beside the device
+CHECKED_SECTIONS = (
+    "seed",
+    "scene",
+    "generator",
+    "choose",
+    "model",
+    "rivals",
+)  # of the configuration, beside the device
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckedScene:
+    """A scene that can run: how many rounds, and what obtaining their pictures would take."""
+
+    rounds: int
+    forecasts: tuple[Forecast, ...] = ()
 
 
 def check_scene(
@@ -31,8 +47,8 @@ def check_scene(
     rounds: int | None = None,
     methods: Sequence[str] = (),
     device: bool = True,
-) -> int:
-    """Compose the configuration for a scene and read all of its pictures; nothing is written.
+) -> CheckedScene:
+    """Compose the configuration for a scene and read all of its pictures; nothing is written, and no request is sent.
 
     Args:
         name: of the scene; selects its own option in ``conf/scene`` if there is one.
@@ -42,9 +58,6 @@ def check_scene(
         rounds: how many rounds are to run; None: all that the scene defines.
         methods: that are to run; reconstructors of others among them that have no weights will say so in their rows.
         device: whether the device must be there; not on a machine that only hands jobs to others.
-
-    Returns:
-        the number of rounds.
 
     Raises:
         UserError: one line about the first problem found.
@@ -61,10 +74,20 @@ def check_scene(
             fix="raise it, or use photos that are less narrow",
         )
     count = len(scene.rounds) if rounds is None else rounds
-    records = [*scene.views.records]
+    records, forecasts = [*scene.views.records], []
     for number in range(1, count + 1):
-        inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator)
-        records += inserted.view.records
+        context = GenerationContext(
+            scene_folder=folder,
+            scene=name,
+            round_number=number,
+            spec=scene.round_spec(number),
+            captured=scene.views,
+            cache=find_project() / GENERATED_FOLDER,
+        )
+        forecast, inserted = check_round(context, config.generator, config.choose)
+        forecasts.append(forecast)
+        if inserted is not None:
+            records += inserted.view.records
     check_truth(folder, records)  # read by the last stages only, so a mistake in it would cost the whole run
     check_weights(config.model)
     for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
@@ -78,7 +101,7 @@ def check_scene(
                     allow_download=section.allow_download,
                 )
             )
-    return count
+    return CheckedScene(rounds=count, forecasts=tuple(forecasts))
 
 
 def check_device(device: str) -> None:

@@ -59,7 +59,8 @@ def filled(path: str) -> str:
         ("resolve", [layout.config("S"), layout.selection("S")]),
         ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
         ("reconstruct", [layout.state("S", 0), layout.statistics("reconstruct", "S")]),
-        ("generate_view", [layout.inserted("S", 2), layout.statistics("generate_view", "S", 2)]),
+        ("generate_view", [layout.candidates("S", 2), layout.statistics("generate_view", "S", 2)]),
+        ("choose_view", [layout.inserted("S", 2), layout.statistics("choose_view", "S", 2)]),
         (
             "precompute_anchors",
             [

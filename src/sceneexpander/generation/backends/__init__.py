@@ -1,0 +1,28 @@
+"""The back-ends by name. A new one is a file here, its settings in ``conf/generator``, and a line in `BACKENDS`; nothing else knows it."""
+
+from __future__ import annotations
+
+from sceneexpander.errors import UserError, did_you_mean
+from sceneexpander.generation.backends.reproject import ReprojectConfig, ReprojectGenerator
+from sceneexpander.generation.backends.stored import FileConfig, FileGenerator, ReplayConfig, ReplayGenerator
+from sceneexpander.generation.config import GeneratorConfig
+from sceneexpander.generation.protocol import Backend, ViewGenerator
+
+BACKENDS: dict[str, Backend] = {
+    "replay": Backend(config=ReplayConfig, make=ReplayGenerator, takes_recorded=True),
+    "file": Backend(config=FileConfig, make=FileGenerator),
+    "reproject": Backend(config=ReprojectConfig, make=ReprojectGenerator),
+}
+
+
+def backend_of(config: GeneratorConfig) -> Backend:
+    """The back-end that the settings name. Raises `UserError` for an unknown name."""
+    if config.backend not in BACKENDS:
+        problem = f"unknown back-end {config.backend!r}"
+        raise UserError(problem, where="generator.backend", fix=did_you_mean(config.backend, BACKENDS))
+    return BACKENDS[config.backend]
+
+
+def make_generator(config: GeneratorConfig) -> ViewGenerator:
+    """The generator with these settings. Raises `UserError` for an unknown name."""
+    return backend_of(config).make(config)
