@@ -22,8 +22,9 @@ repro: .venv/.stamp ## Run the pipeline on the scenes in params.yaml
 
 setup: .venv/.stamp ## Make .venv from requirements.lock
 
-# The lock is installed as it is; the package itself without dependencies (it builds an optional extension).
-.venv/.stamp: requirements.lock requirements-nodeps.lock pyproject.toml
+# The lock is installed as it is; the package itself without dependencies (it builds an optional extension, from KERNEL).
+KERNEL := $(addprefix src/sceneexpander/splatting/kernel/,rasteriser.cpp recipe.py)
+.venv/.stamp: requirements.lock requirements-nodeps.lock pyproject.toml setup.py $(KERNEL)
 	@test -x $(PY) || "$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 		{ echo 'error: PYTHON: "$(PYTHON)" is not Python 3.11 or newer; make PYTHON=/path/to/python3.11' >&2; exit 2; }
 	test -x $(PY) || "$(PYTHON)" -m venv .venv

@@ -1,32 +1,27 @@
 """Build of the compiled CPU rasteriser, optional by design: without a working compiler the install succeeds without it.
 
-Everything else about the package is in ``pyproject.toml``.
+Everything else about the package is in ``pyproject.toml``; how the rasteriser is compiled is in ``recipe.py`` beside its source.
 """
 
 from __future__ import annotations
 
-import platform
+import runpy
 from pathlib import Path
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-SOURCE = "src/sceneexpander/splatting/kernel/rasteriser.cpp"
-# No -ffinite-math-only (NaN must fail comparisons) and no -fassociative-math (exp2 rounds by adding a magic number).
-FLAGS = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fvisibility=hidden"]
-# What is vectorised is written as vectors; packing unrelated scalars of the projection into some costs 6 % (g++ 12).
-FLAGS += ["-fno-tree-slp-vectorize", "-Wno-psabi", "-pthread"]
-
-
-def architectures() -> dict[str, list[str]]:
-    """Library suffix -> flags: two x86-64 levels, of which one is chosen when the library is loaded; elsewhere a plain build."""
-    if platform.machine().lower() in {"x86_64", "amd64"}:
-        return {"v3": ["-march=x86-64-v3"], "v4": ["-march=x86-64-v4", "-mprefer-vector-width=512"]}
-    return {"plain": []}
+KERNEL = Path("src/sceneexpander/splatting/kernel")
+RECIPE = runpy.run_path(str(Path(__file__).parent / KERNEL / "recipe.py"))  # the package may not be importable yet
 
 
 class OptionalKernel(build_ext):
     """Compiles the plain C libraries; a failure is reported and passed over."""
+
+    def finalize_options(self) -> None:
+        """Always compile: a library is told from a newer one by the hash in it, not by the time of its file."""
+        super().finalize_options()
+        self.force = True
 
     def build_extension(self, ext: Extension) -> None:
         # Every build compiles the same file: separate scratch folders keep their objects apart.
@@ -35,22 +30,29 @@ class OptionalKernel(build_ext):
         try:
             super().build_extension(ext)
         except Exception as error:  # noqa: BLE001 - whatever a foreign tool chain throws, the install must go on
+            Path(self.get_ext_fullpath(ext.name)).unlink(missing_ok=True)  # of an earlier build: it would be refused
             self.warn(f"compiled rasteriser not built, the slower torch rasteriser will be used: {error}")
         finally:
             self.build_temp = build_temp
+
+    def copy_extensions_to_source(self) -> None:
+        for ext in self.extensions:
+            (KERNEL / Path(self.get_ext_filename(ext.name)).name).unlink(missing_ok=True)
+        super().copy_extensions_to_source()
 
 
 setup(
     ext_modules=[
         Extension(
-            f"sceneexpander.splatting.kernel._rasteriser_{name}",
-            sources=[SOURCE],
-            extra_compile_args=[*FLAGS, *arch],
+            f"sceneexpander.splatting.kernel._rasteriser_{build}",
+            sources=[str(KERNEL / "rasteriser.cpp")],
+            define_macros=[(RECIPE["HASH_MACRO"], f'"{RECIPE["source_hash"](build)}"')],
+            extra_compile_args=[*RECIPE["FLAGS"], *RECIPE["LEVELS"][build]],
             extra_link_args=["-pthread"],
             language="c++",
             optional=True,
         )
-        for name, arch in architectures().items()
+        for build in RECIPE["builds"]()
     ],
     cmdclass={"build_ext": OptionalKernel},
 )

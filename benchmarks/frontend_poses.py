@@ -39,13 +39,13 @@ from unlike_photos import CASES, SEEDS, Photo, place_of, write_photo
 
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.errors import UserError
-from sceneexpander.expansion.optics import optics_of
 from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.frontend.prior import picture_judge
 from sceneexpander.frontend.sfm import SfmConfig, SparseReconstruction, estimate_cameras
 from sceneexpander.frontend.sfm_types import LearnedUse
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.ingest import IngestConfig, read_views
+from sceneexpander.reconstruction.optics import optics_of
 from sceneexpander.synthetic import make_views
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}

@@ -29,10 +29,10 @@ from sceneexpander.expansion import (
     refined,
     refined_round,
 )
-from sceneexpander.expansion.loaded import load_model
 from sceneexpander.generation import GenerationContext, check_round
 from sceneexpander.ingest import load_scene
 from sceneexpander.project import find_project
+from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 
 

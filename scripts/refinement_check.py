@@ -19,20 +19,29 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import entry_point
+from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import psnr
+from sceneexpander.evaluation.sizes import at_sizes
 from sceneexpander.expansion import initial_state
-from sceneexpander.expansion.loaded import load_model
 from sceneexpander.ingest import load_scene
 from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.optimisation.refine import refine
 from sceneexpander.project import find_project
+from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 
 COVERED = 0.5  # alpha from which on a pixel counts
 
 
+def at_photo_size(reconstruction: Reconstruction, views: ViewSet, posed: list[int]) -> tuple[float, float]:
+    """(mean PSNR, mean open share) of the photos in their own pixels."""
+    config = EvaluateConfig(st_lpips=False)
+    found = [at_sizes(reconstruction, view, views.photo(view), None, config, ("own",))["own"] for view in posed]
+    return sum(size.psnr_db or 0.0 for size in found) / len(found), sum(size.open_share for size in found) / len(found)
+
+
 def shown(reconstruction: Reconstruction, views: ViewSet, view: int) -> float:
-    """PSNR of one photo over the pixels that are covered."""
+    """PSNR of one photo at the stored size over the pixels that are covered."""
     one = slice(view, view + 1)
     cameras = reconstruction.world_from_cam[one], reconstruction.intrinsics_px[one]
     seen = render(reconstruction.gaussians, *cameras, views.height, views.width)
@@ -47,9 +56,12 @@ def check(folder: Path, overrides: list[str]) -> None:
     state, start, _, _ = initial_state(scene, loaded, config.frontend, config.warmup, seed=config.seed)
     views, settings = state.views, config.refine
     posed = start.posed.nonzero()[:, 0].tolist()
-    result, _ = refine(start, views.images, settings, seed=config.seed)
+    result, _ = refine(start, views.images, settings, photos=views.photos, seed=config.seed)
     before, after = (sum(shown(r, views, v) for v in posed) / len(posed) for r in (start, result))
     print(f"{scene.name}: {len(posed)} photos, {len(start.gaussians)} Gaussians, fitted {before:.2f} -> {after:.2f} dB")
+    for name, reconstruction in (("before", start), ("after", result)):
+        own, open_share = at_photo_size(reconstruction, views, posed)
+        print(f"  {name}, in the photos' own pixels: {own:.2f} dB, {100 * open_share:.1f} % open")
     changes = []
     for view in posed:
         before, after = held_out(start, views, view, settings, seed=config.seed)
@@ -65,7 +77,7 @@ def held_out(
     without = replace(start, gaussians=start.gaussians.select(start.gaussians.source_view != view))
     weights = torch.ones_like(start.depth)
     weights[view] = 0
-    fitted, _ = refine(without, views.images, config, weights=weights, seed=seed)
+    fitted, _ = refine(without, views.images, config, photos=views.photos, weights=weights, seed=seed)
     return shown(without, views, view), shown(fitted, views, view)
 
 

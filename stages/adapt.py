@@ -19,7 +19,8 @@ from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, judge
 from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.progress import progress_bar
 from stages import layout
-from stages.runner import Cell, checkpoint_folder, live_folder, remove_folder, run_identity, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, checkpoint_folder, live_folder, remove_checkpoints, remove_folder, run_identity, stage
 
 LOOKS = "looks"  # pictures of the looks, in the log and in the result
 
@@ -42,7 +43,7 @@ class Sections:
 def main(cell: Cell) -> None:
     """Adapt, reconstruct with the adapted weights, and keep the log."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     sources = (
         layout.state(cell.scene, cell.previous),
         layout.inserted(cell.scene, cell.round),
@@ -60,8 +61,11 @@ def main(cell: Cell) -> None:
         _log.warning(
             "%s round %d: the inserted view fits badly: %s", cell.scene, cell.round, "; ".join(verdict.reasons)
         )
-    identity = run_identity(sections, sources)
-    checkpoints, live = checkpoint_folder(identity), live_folder(identity)
+    run = run_identity("adapt", sections, sources)
+    checkpoints, live = checkpoint_folder(run), live_folder(run)
+    if not (checkpoints.is_dir() and (live / LOOKS).is_dir()):  # either is of no use without the other
+        remove_folder(checkpoints)
+        remove_folder(live / LOOKS)
     loaded = load_model(sections.model, sections.device)
     log = LiveLog(live, {"scene": cell.scene, "round": cell.round, "steps": sections.adapt.steps, "sections": sections})
     with progress_bar(f"adapt {cell.scene} round {cell.round}", sections.adapt.steps) as bar:
@@ -104,12 +108,12 @@ def main(cell: Cell) -> None:
         if verdict is not None:
             write_json_atomic(folder / "acceptance.json", verdict)
         write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])
-        looks = {"identity": identity, "looks": [asdict(look) for look in result.looks], "warnings": warnings}
+        looks = {"identity": run.key, "looks": [asdict(look) for look in result.looks], "warnings": warnings}
         write_json_atomic(folder / "looks.json", looks)
         if result.looks:
             shutil.copytree(live / LOOKS, folder / LOOKS)
     log.end({"warnings": warnings})
-    remove_folder(checkpoints)
+    remove_checkpoints(run)
 
 
 if __name__ == "__main__":

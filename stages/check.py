@@ -6,7 +6,8 @@ from pathlib import Path
 
 from sceneexpander.config.overrides import written_out
 from sceneexpander.errors import entry_point
-from sceneexpander.preflight import check_scene
+from sceneexpander.packages import installed_packages
+from sceneexpander.preflight import Checked, check_scene
 from sceneexpander.selection import read_selection
 from stages import layout
 from stages.resolve import CONF
@@ -15,7 +16,9 @@ from stages.resolve import CONF
 @entry_point
 def main() -> None:
     """Raise the first problem as one line."""
+    installed_packages(Path())
     selection = read_selection(Path())
+    checked = Checked()
     for scene in selection.scenes:
         check_scene(
             scene,
@@ -24,6 +27,7 @@ def main() -> None:
             overrides=written_out(selection.overrides),
             rounds=selection.rounds,
             methods=selection.methods,
+            checked=checked,
         )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.store import directory_being_written
-from sceneexpander.config.files import read_yaml
+from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.config.files import read_yaml, write_yaml
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene
 from stages import layout
 from stages.resolve import read_overrides
@@ -35,6 +36,19 @@ def _round(scene: str, number: int, methods: list[str]) -> RoundSource:
     )
 
 
+def _gaussians(scene: str, selected: dict[str, Any]) -> dict[str, str]:
+    """Hash by path of every file of Gaussians that there is."""
+    paths = [
+        layout.gaussians(scene, item["k"], method) for item in selected["rounds"] for method in selected["methods"]
+    ]
+    found: dict[str, str] = {}
+    for path in paths:
+        if path.is_file():
+            with path.open("rb") as file:
+                found[path.as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
+
+
 @stage("scene")
 def main(cell: Cell) -> None:
     """List artefacts by what params.yaml selects: files of rounds or methods that were taken out may still lie there."""
@@ -50,6 +64,9 @@ def main(cell: Cell) -> None:
     )
     with directory_being_written(layout.PAGES / cell.scene) as folder:
         collect_scene(source, folder)
+        # For the recording, which depends on the gathered folders alone.
+        write_yaml(folder / layout.PAGE_CONFIG, source.config)
+        write_json_atomic(folder / layout.PAGE_GAUSSIANS, _gaussians(cell.scene, selected))
 
 
 if __name__ == "__main__":

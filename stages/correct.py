@@ -13,7 +13,8 @@ from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import ModelConfig, RoundInputs, correct_round, load_model, refined_round
 from sceneexpander.optimisation.config import RefineConfig
 from stages import layout
-from stages.runner import Cell, left_out, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, left_out, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +35,7 @@ def main(cell: Cell) -> None:
     if left_out(cell):
         return
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     inputs = RoundInputs(
         state=ExpansionState.load(layout.state(cell.scene, cell.previous)),
         inserted=InsertedView.load(layout.inserted(cell.scene, cell.round)),

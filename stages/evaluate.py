@@ -17,7 +17,8 @@ from sceneexpander.evaluation.evaluate import Navigation, evaluate
 from sceneexpander.evaluation.repeats import over_repeats
 from sceneexpander.evaluation.truth import load_truth
 from stages import layout
-from stages.runner import Cell, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +34,7 @@ class Sections:
 def main(cell: Cell) -> None:
     """Measure on the views of all rounds so far, on the tour, and against known truth where the scene has it."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     made = layout.reconstruction(cell.scene, cell.round, cell.method)
     lacking = unavailable_in(made)
     if lacking is not None:

@@ -12,7 +12,7 @@ __all__ = ["Sections", "main"]
 def main(cell: Cell) -> None:
     """The same optimisation as after the fact, as a baseline of its own."""
     if not left_out(cell):
-        optimise_from(cell, "backbone")
+        optimise_from(cell, "backbone", stage_name="gaussian_splatting")
 
 
 if __name__ == "__main__":

@@ -11,8 +11,11 @@ __all__ = ["CORRECTED", "METHODS", "OPTIMISABLE", "OPTIMISED", "OURS", "RIVALS",
 SCENES = Path("scenes")
 OUTPUTS = Path("outputs")
 PAGES = OUTPUTS / "pages"  # what is shown of every scene, gathered from its artefacts
+PAGE_CONFIG = "config.yaml"  # in a scene's folder of PAGES: its composed configuration
+PAGE_GAUSSIANS = "gaussians.json"  # there as well: hashes of the Gaussians' files, which are too large to be gathered
 REPORT = OUTPUTS / "report"
 CODE = OUTPUTS / "code.json"
+ENVIRONMENT = OUTPUTS / "environment.json"  # that the hashes in CODE belong to
 REPEATS = "repeat_*"
 REFINEMENT = "refinement.json"  # beside a reconstruction whose Gaussians were refined: what it changed
 
@@ -30,6 +33,14 @@ def config(scene: str) -> Path:
 def selection(scene: str) -> Path:
     """Which methods params.yaml asks for: one key per method that is not always made."""
     return OUTPUTS / scene / "methods.yaml"
+
+
+def given(scene: str, kind: str) -> Path:
+    """A folder of links to files that the configuration names, wherever they are: the pipeline depends on their bytes.
+
+    ``kind``: ``generator`` and ``choice`` (a link per round), ``model`` (weights), or a rival's name (weights).
+    """
+    return OUTPUTS / "given" / scene / kind
 
 
 def prepared(scene: str) -> Path:
@@ -85,6 +96,11 @@ def joint_priors(scene: str, number: int) -> Path:
 def renders(scene: str, number: int, method: str) -> Path:
     """Videos and pictures of a method's reconstruction."""
     return round_folder(scene, number) / "renders" / method
+
+
+def gaussians(scene: str, number: int, method: str) -> Path:
+    """A method's Gaussians as PLY."""
+    return renders(scene, number, method) / "gaussians.ply"
 
 
 def packed(scene: str, number: int, method: str) -> Path:

@@ -11,7 +11,7 @@ from sceneexpander.config.files import read_sections
 from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.progress import progress_bar
 from stages import layout
-from stages.runner import Cell, checkpoint_folder, left_out, remove_folder, run_identity, stage, use_threads
+from stages.runner import Cell, checkpoint_folder, left_out, remove_checkpoints, run_identity, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,16 +24,17 @@ class Sections:
     optimise: OptimiseConfig
 
 
-def optimise_from(cell: Cell, start: str) -> None:
+def optimise_from(cell: Cell, start: str, *, stage_name: str) -> None:
     """Make the cell's method from the method ``start``, or write down why it cannot be."""
     # Not at the top: most runs ask for no optimisation, and torch takes seconds to import.
     from sceneexpander.artifacts.inserted import InsertedView
     from sceneexpander.artifacts.reconstruction import Reconstruction
     from sceneexpander.artifacts.views import ViewSet
     from sceneexpander.optimisation.optimise import optimise, unusable
+    from stages.machine import use_machine
 
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     made = layout.reconstruction(cell.scene, cell.round, start)
     target = layout.reconstruction(cell.scene, cell.round, cell.method).parent
     lacking = unavailable_in(made)
@@ -51,7 +52,8 @@ def optimise_from(cell: Cell, start: str) -> None:
         made,
     )
     views = ViewSet.load(sources[0]).append(InsertedView.load(sources[1]).view)
-    checkpoints = checkpoint_folder(run_identity(sections, sources))
+    run = run_identity(stage_name, sections, sources)
+    checkpoints = checkpoint_folder(run)
     config = sections.optimise
     with (
         directory_being_written(target) as folder,
@@ -73,7 +75,7 @@ def optimise_from(cell: Cell, start: str) -> None:
             place = folder / layout.repeat_name(repeat)
             result.reconstruction.save(place)
             write_json_atomic(place / "losses.json", result.losses)
-    remove_folder(checkpoints)
+    remove_checkpoints(run)
 
 
 def _write_reason(reason: Unavailable, target: Path) -> None:
@@ -85,7 +87,7 @@ def _write_reason(reason: Unavailable, target: Path) -> None:
 def main(cell: Cell) -> None:
     """The method's name says what it starts from."""
     if not left_out(cell):
-        optimise_from(cell, cell.method.removesuffix("_optimised"))
+        optimise_from(cell, cell.method.removesuffix("_optimised"), stage_name="optimise")
 
 
 if __name__ == "__main__":

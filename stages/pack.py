@@ -10,7 +10,8 @@ from sceneexpander.artifacts.unavailable import passed_on
 from sceneexpander.config.files import read_sections
 from sceneexpander.viewer.packed import pack_splats
 from stages import layout
-from stages.runner import Cell, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +26,7 @@ class Sections:
 def main(cell: Cell) -> None:
     """Weigh by what the method's own cameras see, keep the heaviest, quantise."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     made = layout.reconstruction(cell.scene, cell.round, cell.method)
     if passed_on(made, layout.packed(cell.scene, cell.round, cell.method)):
         return

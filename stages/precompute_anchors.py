@@ -8,10 +8,13 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import ExpansionState
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, captured_prediction, load_model, refined
 from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.reconstruction.fitting import fitted
+from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+from sceneexpander.reconstruction.views import captured_prediction
 from stages import layout
-from stages.runner import Cell, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +32,7 @@ class Sections:
 def main(cell: Cell) -> None:
     """Predict all views so far, without augmentation, with the weights before the round."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
     anchors, reconstruction = captured_prediction(state, load_model(sections.model, sections.device))
     if cell.previous:
@@ -37,13 +40,8 @@ def main(cell: Cell) -> None:
         last = Reconstruction.load(layout.reconstruction(cell.scene, cell.previous, "sceneexpander"))
         reconstruction, fit = replace(last, method="captured"), None
     else:
-        reconstruction, fit = refined(
-            reconstruction,
-            state.views,
-            sections.refine,
-            doubt_generated=False,
-            seed=sections.seed,
-            device=sections.device,
+        reconstruction, fit = fitted(
+            reconstruction, state.views, sections.refine, seed=sections.seed, device=sections.device
         )
     with directory_being_written(layout.anchors(cell.scene, cell.round)) as folder:
         anchors.save(folder)

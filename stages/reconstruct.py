@@ -8,11 +8,14 @@ from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, initial_state, load_model, report_cameras
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.progress import progress_bar
+from sceneexpander.reconstruction.cameras import report_cameras
+from sceneexpander.reconstruction.initial import initial_state
+from sceneexpander.reconstruction.loaded import ModelConfig, load_model
 from stages import layout
-from stages.runner import Cell, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +34,7 @@ class Sections:
 def main(cell: Cell) -> None:
     """Make the state that round 1 starts from."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     scene = Scene.load(layout.prepared(cell.scene))
     loaded = load_model(sections.model, sections.device)
     with progress_bar(f"warm-up {cell.scene}", sections.warmup.steps) as bar:

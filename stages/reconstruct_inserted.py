@@ -8,11 +8,15 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.state import ExpansionState, save_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, joint_reconstruction, load_model, refined, report_cameras
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.reconstruction.cameras import report_cameras
+from sceneexpander.reconstruction.fitting import fitted
+from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+from sceneexpander.reconstruction.views import joint_reconstruction
 from stages import layout
-from stages.runner import Cell, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,18 +35,17 @@ class Sections:
 def main(cell: Cell) -> None:
     """Cameras and depth of all views together, and the scene the unadapted model makes of them."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
     inserted = InsertedView.load(layout.inserted(cell.scene, cell.round))
     loaded = load_model(sections.model, sections.device)
     priors, reconstruction, sparse = joint_reconstruction(
         state, inserted, loaded, sections.frontend, seed=sections.seed
     )
-    reconstruction, fit = refined(
+    reconstruction, fit = fitted(
         reconstruction,
         state.views.append(inserted.view),
         sections.refine,
-        doubt_generated=False,
         seed=sections.seed,
         device=sections.device,
     )

@@ -11,7 +11,8 @@ from sceneexpander.config.files import read_sections
 from sceneexpander.progress import progress_bar
 from sceneexpander.rendering import RenderConfig, produce_renders
 from stages import layout
-from stages.runner import Cell, stage, use_threads
+from stages.machine import use_machine
+from stages.runner import Cell, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +28,7 @@ class Sections:
 def main(cell: Cell) -> None:
     """Render videos, stills, every view, and the Gaussians as PLY."""
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     made = layout.reconstruction(cell.scene, cell.round, cell.method)
     if passed_on(made, layout.renders(cell.scene, cell.round, cell.method)):
         return

@@ -9,7 +9,7 @@ from sceneexpander.config.files import read_sections
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.optimisation.config import RefineConfig
 from stages import layout
-from stages.runner import Cell, left_out, stage, use_threads
+from stages.runner import Cell, left_out, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,21 +33,20 @@ def main(cell: Cell) -> None:
     from sceneexpander.artifacts.reconstruction import Reconstruction
     from sceneexpander.artifacts.state import load_priors
     from sceneexpander.artifacts.views import ViewSet
-    from sceneexpander.expansion import refined
     from sceneexpander.inference.rivals import reconstruct_rival
     from sceneexpander.models.registry import licence_of
+    from sceneexpander.reconstruction.fitting import fitted
+    from stages.machine import use_machine
 
     sections = read_sections(layout.config(cell.scene), Sections)
-    use_threads(sections.threads)
+    use_machine(sections.threads)
     before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
     views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
     priors = load_priors(layout.joint_priors(cell.scene, cell.round))
     made = reconstruct_rival(cell.method, sections.rivals.of(cell.method), views, priors, device=sections.device)
     fit = None
     if isinstance(made, Reconstruction):
-        made, fit = refined(
-            made, views, sections.refine, doubt_generated=False, seed=sections.seed, device=sections.device
-        )
+        made, fit = fitted(made, views, sections.refine, seed=sections.seed, device=sections.device)
     with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
         made.save(folder / "reconstruction")
         if isinstance(made, Reconstruction):

@@ -18,15 +18,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import (
+    directory_being_written,
+    keep_newest,
+    read_json,
+    write_bytes_atomic,
+    write_json_atomic,
+)
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, disk_full, interruptible
+from sceneexpander.packages import installed_packages
 from sceneexpander.processes import end_with_parent
 from sceneexpander.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
 from stages import layout
 
 STAGE_ENV = "DVC_STAGE"  # set by DVC for the commands that it runs
+UNFINISHED_KEPT = 20  # interrupted works whose resume points stay, the latest first
+LIVE_KEPT = 20  # adaptations whose logs and pictures stay, the latest first
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,24 +55,57 @@ def project_root() -> Path:
     return Path(os.environ.get(ROOT_ENV, ".")).resolve()
 
 
-def checkpoint_folder(key: str) -> Path:
-    """Where unfinished work of this identity keeps its resume points."""
-    return project_root() / ".cache" / "ckpt" / key
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunIdentity:
+    """What a run belongs to. Another run never finds its resume points."""
+
+    work: str  # hash of configuration and input bytes
+    code: str  # hash of the stage's code and environment
+
+    @property
+    def key(self) -> str:
+        """Of both."""
+        return hashlib.sha256(f"{self.work}\n{self.code}".encode()).hexdigest()[:32]
 
 
-def run_identity(sections: object, inputs: Sequence[Path]) -> str:
-    """Key of the resume points: configuration and input bytes. Another run never finds them."""
+def checkpoint_folder(run: RunIdentity) -> Path:
+    """Where unfinished work of this identity keeps its resume points. What other code left of the same work is said and deleted."""
+    folder = project_root() / ".cache" / "ckpt" / run.work
+    own = folder / run.code[:32]
+    keep_newest(folder.parent, UNFINISHED_KEPT - 1, beside=folder)
+    for other in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if other != own:
+            _log.warning(
+                "a resume point of other code or another environment is not continued: the work starts again (%s)",
+                other,
+            )
+            remove_folder(other)
+    return own
+
+
+def remove_checkpoints(run: RunIdentity) -> None:
+    """Once the result is safe."""
+    remove_folder(project_root() / ".cache" / "ckpt" / run.work)
+
+
+def run_identity(stage_name: str, sections: object, inputs: Sequence[Path]) -> RunIdentity:
+    """The identity of a stage's work with these sections and these artefacts."""
     digest = hashlib.sha256(repr(sections).encode())
     for folder in inputs:
         for path in sorted(p for p in folder.rglob("*") if p.is_file()):
             digest.update(f"{path.as_posix()}\n".encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()[:32]
+    return RunIdentity(work=digest.hexdigest()[:32], code=read_json(layout.CODE)[stage_name])
 
 
-def live_folder(key: str) -> Path:
-    """Where a running adaptation of this identity keeps its log and pictures; see `sceneexpander.artifacts.live`."""
-    return project_root() / LIVE_FOLDER / key
+def live_folder(run: RunIdentity) -> Path:
+    """Where a running adaptation of this identity keeps its log and pictures; see `sceneexpander.artifacts.live`.
+
+    The newest `LIVE_KEPT` folders stay; older ones are deleted.
+    """
+    own = project_root() / LIVE_FOLDER / run.key
+    keep_newest(own.parent, LIVE_KEPT - 1, beside=own)
+    return own
 
 
 def stage(*axes: str) -> Callable[[Callable[[Cell], None]], Callable[[], None]]:
@@ -82,8 +126,11 @@ def stage(*axes: str) -> Callable[[Callable[[Cell], None]], Callable[[], None]]:
                 end_with_parent()  # an orphan would write into folders that the next run writes to as well
             cell = _parse(name, axes)
             logging.basicConfig(level=logging.INFO, format=f"%(levelname)s {name}: %(message)s")
+            statistics = _statistics_path(name, axes, cell)
             try:
-                with _measured(_statistics_path(name, axes, cell)):
+                if statistics is not None:
+                    installed_packages(Path())
+                with _measured(statistics):
                     body(cell)
             except UserError as error:
                 _refuse(error)
@@ -164,11 +211,12 @@ def left_out(cell: Cell) -> bool:
 
 
 def use_threads(count: int) -> None:
-    """Limit torch to ``count`` threads; 0 keeps its own choice."""
-    if count > 0:
-        import torch
+    """Work with exactly ``count`` threads, whatever the shell says."""
+    import threadpoolctl
+    import torch
 
-        torch.set_num_threads(count)
+    threadpoolctl.threadpool_limits(count)  # numpy's: it, too, adds up in another order for every number
+    torch.set_num_threads(count)
 
 
 def remove_folder(path: Path) -> None:

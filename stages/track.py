@@ -40,7 +40,7 @@ def commit_of(folder: Path) -> str:
 
 
 def _large_files(scene: str, number: int, method: str) -> list[Path]:
-    return [layout.renders(scene, number, method) / "gaussians.ply"]
+    return [layout.gaussians(scene, number, method)]
 
 
 @stage()
@@ -52,7 +52,7 @@ def main(_: Cell) -> None:
     keys: dict[str, list[str] | None] = {}
     root = project_root()
     for scene in read_selection(Path()).scenes:
-        sections = read_sections(layout.config(scene), Sections)
+        sections = read_sections(layout.PAGES / scene / layout.PAGE_CONFIG, Sections)
         records = scene_runs(
             layout.PAGES / scene,
             commit=commit_of(root),

@@ -20,6 +20,7 @@ from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.environment import find_environment
 from sceneexpander.errors import UserError, did_you_mean, entry_point
 from sceneexpander.expandbench.document import Measured, Results, written
 from sceneexpander.expandbench.grades import GRADES, grade_named
@@ -99,9 +100,9 @@ def _composed(project: Path, overrides: Sequence[str], experiment: str = "expand
 
 
 def code_of(project: Path) -> str:
-    """What determines a cell: the code of the benchmark and all it imports."""
+    """What determines a cell beside its configuration: the code of the benchmark, all it imports, and the environment."""
     tree = SourceTree(packages={"sceneexpander": project / "src" / "sceneexpander"})
-    return tree.fingerprint("sceneexpander.expandbench.run")
+    return find_environment(project).identify(tree, "sceneexpander.expandbench.run")
 
 
 @entry_point

@@ -8,6 +8,7 @@ count.
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -70,7 +71,8 @@ class SourceTree:
             digest.update(f"{name}\n{meaning(path)}\n".encode())
             if path.parent not in self.packages.values() or path.name != "__init__.py":
                 folders.add(path.parent)
-        for asset in sorted({asset for folder in folders for asset in _assets(folder)}):
+        roots = set(self.packages.values())
+        for asset in sorted({asset for folder in folders for asset in _assets(folder, whole=folder not in roots)}):
             digest.update(f"{self._label(asset)}\n".encode())
             digest.update(hashlib.sha256(asset.read_bytes()).digest())
         return digest.hexdigest()
@@ -83,7 +85,7 @@ class SourceTree:
 
     def _imports(self, module: str, path: Path) -> Iterator[str]:
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-        tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+        tree = _parsed(path.read_text(encoding="utf-8"), str(path))
         declared = _declared_imports(tree)
         yield from declared or ()
         for node in ast.walk(tree):
@@ -107,7 +109,18 @@ class SourceTree:
 
 def meaning(path: Path) -> str:
     """The syntax tree of a Python file as text, without docstrings, comments and positions."""
-    tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+    return _meaning(path.read_text(encoding="utf-8"), str(path))
+
+
+# Stages share most of their modules.
+@functools.lru_cache(maxsize=1024)
+def _parsed(text: str, name: str) -> ast.Module:
+    return ast.parse(text, filename=name)
+
+
+@functools.lru_cache(maxsize=1024)
+def _meaning(text: str, name: str) -> str:
+    tree = ast.parse(text, filename=name)
     for node in ast.walk(tree):
         if isinstance(node, _DOCUMENTED) and node.body and _is_docstring(node.body[0]):
             node.body = node.body[1:] or [ast.Pass()]
@@ -146,12 +159,16 @@ def _declared_imports(tree: ast.Module) -> Sequence[str] | None:
     return None
 
 
-def _assets(folder: Path) -> Iterator[Path]:
-    """Data files of a package folder and of its sub-folders that hold no Python (those are packages of their own)."""
+def _assets(folder: Path, *, whole: bool) -> Iterator[Path]:
+    """Data files of a package folder and of its sub-folders.
+
+    Sub-folders that hold Python are packages of their own. With ``whole`` their data counts all the same, imported or not: what lies in
+    a room may be read by any of its modules.
+    """
     for path in sorted(folder.iterdir()):
         if path.name.startswith((".", "__pycache__")):
             continue
         if path.is_file() and path.suffix not in _IGNORED_SUFFIXES:
             yield path
-        elif path.is_dir() and not any(path.rglob("*.py")):
-            yield from _assets(path)
+        elif path.is_dir() and (whole or not any(path.rglob("*.py"))):
+            yield from _assets(path, whole=whole)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from sceneexpander.config.compose import compose, scene_option
@@ -13,12 +13,29 @@ from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation import check_truth
 from sceneexpander.evaluation.image import WINDOW
-from sceneexpander.expansion import ModelConfig, load_model
 from sceneexpander.generation import Forecast, GenerationContext, check_round
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
 from sceneexpander.models.weights import HUB_ID
 from sceneexpander.project import GENERATED_FOLDER, find_project
+from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckedScene:
+    """A scene that can run: how many rounds, and what obtaining their pictures would take."""
+
+    rounds: int
+    forecasts: tuple[Forecast, ...] = ()
+
+
+@dataclass(slots=True)
+class Checked:
+    """What this command has looked at already, so that scenes and jobs that share it do not wait for it again."""
+
+    weights: set[ModelConfig] = field(default_factory=set)
+    pictures: dict[Hashable, CheckedScene] = field(default_factory=dict)
+
 
 CHECKED_SECTIONS = (
     "seed",
@@ -30,14 +47,6 @@ CHECKED_SECTIONS = (
 )  # of the configuration, beside the device
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckedScene:
-    """A scene that can run: how many rounds, and what obtaining their pictures would take."""
-
-    rounds: int
-    forecasts: tuple[Forecast, ...] = ()
-
-
 def check_scene(
     name: str,
     folder: Path,
@@ -47,6 +56,7 @@ def check_scene(
     rounds: int | None = None,
     methods: Sequence[str] = (),
     device: bool = True,
+    checked: Checked | None = None,
 ) -> CheckedScene:
     """Compose the configuration for a scene and read all of its pictures; nothing is written, and no request is sent.
 
@@ -58,6 +68,7 @@ def check_scene(
         rounds: how many rounds are to run; None: all that the scene defines.
         methods: that are to run; reconstructors of others among them that have no weights will say so in their rows.
         device: whether the device must be there; not on a machine that only hands jobs to others.
+        checked: of the same command's earlier calls; weights are loaded and pictures decoded once.
 
     Raises:
         UserError: one line about the first problem found.
@@ -65,6 +76,31 @@ def check_scene(
     config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
     if device:
         check_device(config.device)
+    checked = Checked() if checked is None else checked
+    pictures = folder, config.scene, repr(config.generator), config.choose, rounds
+    if pictures not in checked.pictures:
+        checked.pictures[pictures] = _check_pictures(name, folder, config, rounds)
+    needed = [config.model]
+    for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
+        section = config.rivals.of(rival)
+        if section.weights is not None:
+            needed.append(
+                ModelConfig(
+                    name=rival,
+                    variant=section.variant,
+                    weights=section.weights,
+                    allow_download=section.allow_download,
+                )
+            )
+    for model in needed:
+        if model not in checked.weights:
+            check_weights(model)
+            checked.weights.add(model)
+    return checked.pictures[pictures]
+
+
+def _check_pictures(name: str, folder: Path, config: ProjectConfig, rounds: int | None) -> CheckedScene:
+    """Read the photos, the pictures to insert that are there already, and what is known of the truth."""
     scene = load_scene(folder, config.scene)
     if min(scene.views.height, scene.views.width) < WINDOW:
         size = f"{scene.views.width} x {scene.views.height}"
@@ -89,18 +125,6 @@ def check_scene(
         if inserted is not None:
             records += inserted.view.records
     check_truth(folder, records)  # read by the last stages only, so a mistake in it would cost the whole run
-    check_weights(config.model)
-    for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
-        section = config.rivals.of(rival)
-        if section.weights is not None:
-            check_weights(
-                ModelConfig(
-                    name=rival,
-                    variant=section.variant,
-                    weights=section.weights,
-                    allow_download=section.allow_download,
-                )
-            )
     return CheckedScene(rounds=count, forecasts=tuple(forecasts))
 
 

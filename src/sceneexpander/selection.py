@@ -24,7 +24,9 @@ OPTIMISABLE = ("sceneexpander", *RIVALS)  # what an optimisation after the fact 
 CORRECTED = "corrected"  # ours without a step: what Algorithm 1 is to be compared with
 OPTIMISED = (SPLATTED, *(f"{method}_optimised" for method in OPTIMISABLE))
 METHODS = (*OURS, CORRECTED, *RIVALS, *OPTIMISED)
-RESERVED = frozenset({"pages", "report", "code.json"})  # in outputs/, where every scene has a folder of its name
+RESERVED = frozenset(
+    {"pages", "report", "given", "code.json", "environment.json"}
+)  # in outputs/, where every scene has a folder of its name
 MOST_ROUNDS = 100
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 _KEYS = ("scenes", "rounds", "methods", "overrides")

@@ -18,7 +18,7 @@ from sceneexpander.config.compose import compose, scene_option
 from sceneexpander.config.overrides import environment_hidden, key_of, written_out
 from sceneexpander.config.parse import ConfigError
 from sceneexpander.errors import UserError, did_you_mean, disk_full, entry_point
-from sceneexpander.preflight import CHECKED_SECTIONS, check_scene
+from sceneexpander.preflight import CHECKED_SECTIONS, Checked, check_scene
 from sceneexpander.processes import run_group
 from sceneexpander.project import ROOT_ENV, find_project
 from sceneexpander.selection import Selection, read_selection
@@ -34,6 +34,7 @@ SCENE_KEY = "scene"  # the axis as people write it
 _HYDRA_SCENE_KEY = "+swept_scene"  # as Hydra gets it: its own group ``scene`` holds settings, not folders
 MOST_VALUES = 1000  # of one key: each is a run of its own
 KEPT = ("outputs/report", "outputs/pages", "params.yaml", "dvc.lock")  # of a finished job; the rest is in the cache
+_CHECKED = Checked()  # by this process: pictures and weights that jobs share are read once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +86,7 @@ def _check(selection: Selection, project: Path, *, device: bool = True) -> None:
             rounds=selection.rounds,
             methods=selection.methods,
             device=device,
+            checked=_CHECKED,
         )
 
 

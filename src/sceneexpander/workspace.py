@@ -25,6 +25,7 @@ from pathlib import Path
 from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.config.overrides import key_of, written_out
 from sceneexpander.errors import UserError, interruptible, printable
+from sceneexpander.packages import LOCKS
 from sceneexpander.processes import ended_by_signals, kept
 from sceneexpander.project import SWEEP_ENV, find_project
 from sceneexpander.selection import PARAMS, Selection
@@ -32,7 +33,7 @@ from sceneexpander.surroundings import LOCAL_CONFIG, local_config, pipeline_envi
 from sceneexpander.tracking.store import ignored_note
 
 COPIED_FOLDERS = ("conf", "src", "stages")
-COPIED_FILES = ("dvc.yaml", ".dvcignore", "pyproject.toml", ".dvc/config")
+COPIED_FILES = ("dvc.yaml", ".dvcignore", "pyproject.toml", *LOCKS, ".dvc/config")
 ERROR_FILE = "error.txt"
 _NOT_COPIED = shutil.ignore_patterns("__pycache__", "*.pyc", "*.egg-info", ".*.part")
 _LITTLE_BYTES = 1 << 20  # a disk with less than that is full

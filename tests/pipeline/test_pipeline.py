@@ -21,6 +21,7 @@ from PIL import Image
 
 from sceneexpander.selection import CORRECTED, OURS, Selection
 from sceneexpander.workspace import make_workspace, workspace_environment
+from stages import layout
 
 pytestmark = pytest.mark.pipeline
 
@@ -72,7 +73,11 @@ class Project:
         selection = Selection(scenes=("room",), rounds=1, methods=METHODS, overrides=overrides)
         make_workspace(folder, selection, project=ROOT, scenes={"room": scene})
         (folder / ".dvc" / "config.local").write_text("[core]\n    no_scm = true\n")
-        self.environment = {**workspace_environment(folder, folder), "OMP_NUM_THREADS": "1"}
+        self.opened = folder.parent / f"{folder.name}-opened"  # of every stage: the files that it has read
+        self.opened.mkdir()
+        environment = workspace_environment(folder, folder)
+        path = os.pathsep.join([str(ROOT / "tests" / "support" / "opened"), environment["PYTHONPATH"]])
+        self.environment = {**environment, "PYTHONPATH": path, "OPENED_FOLDER": str(self.opened)}
 
     def run(self, *command: str, check: bool = True) -> subprocess.CompletedProcess[str]:
         done = subprocess.run(
@@ -130,6 +135,28 @@ def test_everything_that_was_promised_is_there(finished: Project) -> None:
     assert set(numbers["room"]["round_1"]) == set(METHODS)
     log = json.loads((outputs / "room" / "round_1" / "sceneexpander" / "log.json").read_text())
     assert [record["step"] for record in log] == [1, 2, 3, 4]
+
+
+def test_stages_read_what_they_depend_on_and_nothing_else(finished: Project) -> None:
+    lock = yaml.safe_load((finished.folder / "dvc.lock").read_text())["stages"]
+    notes = {path.name: path.read_text().splitlines() for path in finished.opened.iterdir()}
+    assert set(notes) == set(lock)
+    # By the hashes of the code, which each stage depends on its own of.
+    hashes = {"outputs/code.json", "outputs/environment.json", "requirements.lock", "requirements-nodeps.lock"}
+    # By hashes in the gathered folder: the Gaussians are too large to lie there as well.
+    gathered = set(json.loads((finished.folder / layout.PAGES / "room" / layout.PAGE_GAUSSIANS).read_text()))
+    for stage, files in notes.items():
+        entry = lock[stage]
+        known = {item["path"] for item in entry["deps"] + entry["outs"]} | set(entry.get("params", ())) | hashes
+        known |= gathered if stage == "track" else set()
+        for file in files:
+            path = Path(file)
+            if not path.is_relative_to(finished.folder) or path.suffix in {".py", ".pyc"}:
+                continue
+            inside = path.relative_to(finished.folder)
+            if inside.parts[0] in {"src", "stages", ".dvc"} or any(part.startswith(".") for part in inside.parts):
+                continue  # code, and what is being written
+            assert {inside.as_posix(), *(parent.as_posix() for parent in inside.parents)} & known, f"{stage}: {inside}"
 
 
 def test_nothing_changed_runs_nothing(finished: Project) -> None:

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,8 @@ FILES = {
     "pkg/room/__init__.py": "",
     "pkg/room/c.py": "VALUE = 1\n",
     "pkg/room/weights/w.bin": "bytes",
+    "pkg/room/native/__init__.py": "",
+    "pkg/room/native/kernel.cpp": "int f();",
     "pkg/unused.py": "import os\n",
     "pkg/other/__init__.py": "",
     "pkg/other/data.txt": "x",
@@ -59,6 +64,7 @@ def test_what_means_the_same_or_is_not_used_changes_nothing(tree: SourceTree, na
         ("pkg/__init__.py", "SWITCH = True\n"),
         ("pkg/room/weights/w.bin", "other"),
         ("pkg/room/weights/more.bin", "new"),
+        ("pkg/room/native/kernel.cpp", "int g();"),
     ],
 )
 def test_what_is_used_counts_down_to_data_files(tree: SourceTree, name: str, text: str) -> None:
@@ -84,3 +90,53 @@ def test_the_projects_own_stages_have_a_closure() -> None:
     # An edit of the adaptation must not prepare every scene again, nor one of the report adapt again.
     assert not any(name.startswith(("sceneexpander.adaptation", "sceneexpander.models")) for name in prepare)
     assert not any(name.startswith(("sceneexpander.report", "sceneexpander.tracking")) for name in adapt)
+
+
+def test_the_rasterisers_source_and_flags_are_code_of_all_that_render(tmp_path: Path) -> None:
+    root = Path(__file__).parents[2]
+    shutil.copytree(root / "src" / "sceneexpander", tmp_path / "sceneexpander", ignore=shutil.ignore_patterns("*.so"))
+    ours = SourceTree(packages={"sceneexpander": tmp_path / "sceneexpander", "stages": root / "stages"})
+    stages = (
+        "prepare",
+        "reconstruct",
+        "precompute_anchors",
+        "adapt",
+        "gaussian_splatting",
+        "optimise",
+        "render",
+        "pack",
+        "evaluate",
+    )
+    for edited in ("rasteriser.cpp", "recipe.py"):
+        before = {stage: ours.fingerprint(f"stages.{stage}") for stage in stages}
+        source = tmp_path / "sceneexpander" / "splatting" / "kernel" / edited
+        source.write_text(source.read_text().replace("1e-4f", "2e-4f").replace('"-O3"', '"-O2"'))
+        changed = {stage for stage in stages if ours.fingerprint(f"stages.{stage}") != before[stage]}
+        assert changed == set(stages) - {"prepare"}
+
+
+def test_an_edit_of_the_adaptation_reruns_no_reconstructor() -> None:
+    root = Path(__file__).parents[2]
+    ours = SourceTree(packages={"sceneexpander": root / "src" / "sceneexpander", "stages": root / "stages"})
+
+    def adaptation(stage: str) -> set[str]:
+        room = "sceneexpander.adaptation"
+        return {
+            name.removeprefix(f"{room}.") for name in ours.closure(f"stages.{stage}") if name.startswith(f"{room}.")
+        }
+
+    # What they run of that room themselves, and no more: the warm-up, and the trust in pictures inserted before.
+    assert adaptation("reconstruct") == {"warmup", "photometric"}
+    assert adaptation("precompute_anchors") == {"consistency"}
+    assert adaptation("reconstruct_inserted") == set()
+    assert adaptation("rival") == set()
+    assert "loop" in adaptation("adapt")
+
+
+@pytest.mark.parametrize("stage", ["prepare", "generate_view", "reconstruct_inserted", "evaluate", "track"])
+def test_what_a_stage_imports_is_in_its_closure(stage: str) -> None:
+    root = Path(__file__).parents[2]
+    ours = SourceTree(packages={"sceneexpander": root / "src" / "sceneexpander", "stages": root / "stages"})
+    program = f"import stages.{stage}, sys; print(*(n for n in sys.modules if n.split('.')[0] in ('sceneexpander', 'stages')))"
+    done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) <= set(ours.closure(f"stages.{stage}"))

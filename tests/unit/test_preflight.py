@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
+from pathlib import Path
 
 import pytest
 import torch
 
+from sceneexpander import preflight
 from sceneexpander.errors import UserError
 from sceneexpander.expansion import ModelConfig
-from sceneexpander.preflight import check_device, check_weights
+from sceneexpander.preflight import Checked, check_device, check_scene, check_weights
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("spec", ["org/name@rev", "org/name@main", "some-org/some.model@0123abc"])
@@ -45,3 +50,23 @@ def test_a_device_is_there(device: str, count: int, fine: bool, monkeypatch: pyt
     else:
         with pytest.raises(UserError, match=rf"^device: is '{device}'"):
             check_device(device)
+
+
+def test_scenes_and_jobs_of_one_command_share_what_was_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = shutil.copytree(ROOT / "scenes" / "courtyard", tmp_path / "courtyard")
+    seen: list[str] = []
+    for name in ("load_model", "load_scene"):
+        real = getattr(preflight, name)
+        monkeypatch.setattr(preflight, name, lambda *a, name=name, real=real: (seen.append(name), real(*a))[1])
+    checked = Checked()
+    jobs = [("profile=smoke",), ("profile=smoke", "adapt.steps=3"), ("profile=smoke", "seed=4")]
+    counts = {
+        check_scene("courtyard", scene, conf=ROOT / "conf", overrides=job, rounds=1, checked=checked).rounds
+        for job in jobs
+    }
+    assert counts == {1}
+    assert sorted(seen) == ["load_model", "load_scene"]
+    check_scene("courtyard", scene, conf=ROOT / "conf", overrides=["scene.long_side_px=98"], rounds=1, checked=checked)
+    assert sorted(seen) == ["load_model", "load_scene", "load_scene"], "photos of another size are looked at"

@@ -66,6 +66,26 @@ def test_recorded_runs_are_left_alone(tmp_path: Path, monkeypatch: pytest.Monkey
     assert track.MARKER == RECORDED
 
 
+@pytest.mark.parametrize(("uri", "kept"), [("local", False), ("off", True), ("http://host:5000", True)])
+def test_a_lost_local_database_is_filled_again(
+    uri: str, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SCENEEXPANDER_ROOT", raising=False)
+    for path, text in (
+        (RECORDED, '{"room": ["key"]}'),
+        (Path("outputs/room/config.yaml"), f"tracking: {{uri: '{uri}', experiment: e}}"),
+        (Path("mlflow/mlflow.db"), "a database"),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    ask_for_recording()
+    assert RECORDED.exists(), "the runs are there"
+    Path("mlflow/mlflow.db").unlink()
+    ask_for_recording()
+    assert RECORDED.exists() == kept
+
+
 def test_without_git_the_commit_is_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert track.commit_of(tmp_path) == "unknown"

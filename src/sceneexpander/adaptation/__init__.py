@@ -1,5 +1,1 @@
-"""Test-time adaptation: Algorithm 1 of the paper."""
-
-from sceneexpander.adaptation.config import AdaptConfig, AugmentConfig, DepthDistance, DriftForm, Gauge, SubsetRule
-
-__all__ = ["AdaptConfig", "AugmentConfig", "DepthDistance", "DriftForm", "Gauge", "SubsetRule"]
+"""Test-time adaptation: Algorithm 1 of the paper. Modules are imported one by one: a stage depends on what it runs."""

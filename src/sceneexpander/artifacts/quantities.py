@@ -106,15 +106,14 @@ METHOD_TITLES = {
 def _at_size(
     part: str, group: Group, where: str, title: str, meanings: tuple[str, str, str, str]
 ) -> tuple[Quantity, ...]:
-    """The numbers of a `SizeMetrics`: PSNR, SSIM, ST-LPIPS and the open share."""
+    """The numbers of a `SizeMetrics`: PSNR, SSIM, ST-LPIPS and the open share; their names go into ``title``."""
     psnr, ssim, st_lpips, opened = meanings
-    behind = f", {title}" if title else ""
     return (
         Quantity(
             name=f"{part}.psnr_db",
             metric=f"psnr_{where}_db",
             group=group,
-            title=f"PSNR{behind}",
+            title=title.format("PSNR"),
             unit="dB",
             better="higher",
             meaning=psnr,
@@ -123,7 +122,7 @@ def _at_size(
             name=f"{part}.ssim",
             metric=f"ssim_{where}",
             group=group,
-            title=f"SSIM{behind}",
+            title=title.format("SSIM"),
             digits=3,
             better="higher",
             meaning=ssim,
@@ -132,7 +131,7 @@ def _at_size(
             name=f"{part}.st_lpips",
             metric=f"st_lpips_{where}",
             group=group,
-            title=f"ST-LPIPS{behind}",
+            title=title.format("ST-LPIPS"),
             digits=4,
             better="lower",
             meaning=st_lpips,
@@ -141,7 +140,7 @@ def _at_size(
             name=f"{part}.open_share",
             metric=f"seen_through_{where}",
             group=group,
-            title=f"Open{behind}",
+            title=title.format("Open"),
             unit="%",
             digits=1,
             better="lower",
@@ -155,7 +154,7 @@ QUALITY = (
         "own",
         Group.QUALITY,
         "at_photo_size",
-        "",
+        "{}",
         (
             "Preservation: captured views rendered at the method's own cameras, against the photos in the photos' own pixels; "
             "mean over views.",
@@ -193,15 +192,15 @@ QUALITY = (
         "half",
         Group.QUALITY,
         "captured_half_size",
-        "half the stored size",
+        "{}, half the stored size",
         ("The same from farther away.", "", "", ""),
     ),
-    *_at_size("double", Group.QUALITY, "captured_double_size", "twice the stored size", ("", "", "", "")),
+    *_at_size("double", Group.QUALITY, "captured_double_size", "{}, twice the stored size", ("", "", "", "")),
     *_at_size(
         "quadruple",
         Group.QUALITY,
         "captured_quadruple_size",
-        "four times the stored size",
+        "{}, four times the stored size",
         ("", "", "", "The share that one looks through when the pictures are drawn at four times the stored size."),
     ),
     Quantity(
@@ -231,7 +230,7 @@ INSERTION = (
         "inserted_own",
         Group.INSERTION,
         "at_picture_size",
-        "inserted view",
+        "Inserted {}",
         (
             "Expansion: the scene at the inserted camera against the inserted picture, in that picture's own pixels.",
             "",

@@ -294,6 +294,15 @@ def load_resume_point(
         return None
 
 
+def keep_newest(folder: Path, count: int, *, beside: Path | None = None) -> None:
+    """Delete all but the ``count`` sub-folders that were changed last; ``beside``, one of them, stays and does not count."""
+    if not folder.is_dir():
+        return
+    others = [path for path in folder.iterdir() if path.is_dir() and path != beside]
+    for path in sorted(others, key=lambda path: path.stat().st_mtime, reverse=True)[count:]:
+        shutil.rmtree(path, ignore_errors=True)
+
+
 def require_tensor(tensors: Mapping[str, Tensor], name: str, folder: Path) -> Tensor:
     """The named tensor, or an `ArtifactError` naming what is missing."""
     if name not in tensors:

@@ -10,13 +10,13 @@ from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
-from sceneexpander.expansion import ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import ChoiceConfig, GeneratorConfig
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
 from sceneexpander.optimisation.config import OptimiseConfig, RefineConfig
 from sceneexpander.ranges import Range, check_ranges
+from sceneexpander.reconstruction.loaded import ModelConfig
 from sceneexpander.rendering import RenderConfig
 from sceneexpander.tracking import TrackingConfig
 from sceneexpander.typed import shorten
@@ -26,7 +26,7 @@ _DEVICE = re.compile(r"cpu|cuda(:[0-9]{1,3})?")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProjectConfig:
-    """Everything that can be chosen. ``threads`` are torch's; 0 leaves them at its own choice."""
+    """Everything that can be chosen. ``threads``: of torch and numpy; 0: one for each processor that there is."""
 
     seed: Annotated[int, Range(0, 2**63 - 1)]
     device: str  # "cpu", "cuda", "cuda:1"

@@ -20,11 +20,11 @@ from sceneexpander.evaluation.truth import SceneTruth
 from sceneexpander.expandbench.grades import Grade
 from sceneexpander.expandbench.scenes import BenchScene
 from sceneexpander.expansion import LoadedModel, RoundInputs, captured_prediction, initial_state
-from sceneexpander.expansion.rounds import reconstruct, views_priors
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.gauge import in_gauge_of
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.similarity import Similarity, align_views
+from sceneexpander.reconstruction.views import reconstruct, views_priors
 
 SEED = 0  # of the front-end and the warm-up: the same estimate for every row and seed
 

@@ -20,17 +20,19 @@ from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import WeightsChange
-from sceneexpander.artifacts.store import read_json, to_plain, write_json_atomic
+from sceneexpander.artifacts.store import keep_newest, read_json, to_plain, write_json_atomic
 from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.measure import BenchNumbers, measure
 from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.scenes import BenchScene, build_scene
 from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model, refined, refined_round
-from sceneexpander.expansion.rounds import RoundInputs, adapted_weights, aligned, finished_round, reconstruct
+from sceneexpander.expansion.rounds import RoundInputs, adapted_weights, aligned, finished_round
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.reconstruction.views import reconstruct
 
 CAPTURED = "captured"  # the pre-insertion scene
+PREPARED_KEPT = 4  # codes and configurations whose prepared scenes stay, the last used first
 BASELINE = "baseline"  # the same weights given the inserted view
 _log = logging.getLogger(__name__)
 
@@ -139,7 +141,11 @@ class _Worker:
         # What the fit starts from is the same whatever the fit.
         code = "" if settings.any_code else settings.code
         key = hashlib.sha256(f"{json.dumps(before, sort_keys=True)}:{code}".encode()).hexdigest()
-        self.folder = settings.cache / "prepared" / key[:16] / name
+        prepared = settings.cache / "prepared" / key[:16]
+        prepared.mkdir(parents=True, exist_ok=True)
+        prepared.touch()
+        keep_newest(prepared.parent, PREPARED_KEPT - 1, beside=prepared)
+        self.folder = prepared / name
         self._scene: BenchScene | None = None
         self._loaded: LoadedModel | None = None
         self._prepared: PreparedScene | None = None

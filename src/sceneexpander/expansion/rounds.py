@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sceneexpander.adaptation.acceptance import Acceptance, AcceptanceLimits, captured_moved, judge_candidate
 from sceneexpander.adaptation.config import AdaptConfig, Realign, Spend
-from sceneexpander.adaptation.consistency import pixel_trust, trusted
+from sceneexpander.adaptation.consistency import trusted
 from sceneexpander.adaptation.corrections import Corrections, Estimate
 from sceneexpander.adaptation.gaps import closed
 from sceneexpander.adaptation.gaussian_head import fit_gaussian_head
@@ -21,26 +21,21 @@ from sceneexpander.adaptation.loop import AdaptationInputs, AdaptationResult, St
 from sceneexpander.adaptation.observe import Look
 from sceneexpander.adaptation.realign import realign
 from sceneexpander.adaptation.tone import match_tone
-from sceneexpander.adaptation.warmup import WarmupConfig, WarmupReport, warm_up
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.scene import KnownCameras, Scene
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.artifacts.views import ViewSet, to_bytes
-from sceneexpander.expansion.cameras import announce_cameras, report_cameras, straighten_views
-from sceneexpander.expansion.loaded import LoadedModel
-from sceneexpander.expansion.optics import known_of, optics_of
-from sceneexpander.frontend.prior import FrontendConfig, build_priors
-from sceneexpander.frontend.sfm import SparseReconstruction
-from sceneexpander.geometry.gauge import in_gauge_of, posed_in_both
+from sceneexpander.geometry.gauge import posed_in_both
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
-from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.protocol import Prediction
 from sceneexpander.optimisation.config import RefineConfig
-from sceneexpander.optimisation.refine import RefineReport, refine
+from sceneexpander.optimisation.refine import RefineReport
+from sceneexpander.reconstruction.loaded import LoadedModel
+from sceneexpander.reconstruction.refining import refined
+from sceneexpander.reconstruction.views import device_priors, predict, reconstruct
 from sceneexpander.splatting import render
 
 _log = logging.getLogger(__name__)
@@ -70,134 +65,6 @@ class RoundInputs:
     def views(self) -> ViewSet:
         """All views as the adaptation takes them, the inserted one last."""
         return self.state.toned_views.append(self.inserted_view)
-
-
-def views_priors(
-    views: ViewSet,
-    loaded: LoadedModel,
-    frontend: FrontendConfig,
-    *,
-    seed: int,
-    known: KnownCameras | None = None,
-) -> tuple[Priors, SparseReconstruction | None]:
-    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing.
-
-    ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told.
-    """
-    if not loaded.uses_front_end:
-        return Priors(), None
-    known = known_of(views, known)
-    if any(
-        record.distortion != (0.0, 0.0) for record in views.records
-    ):  # straightened before; what is left is nothing to look for
-        frontend = replace(frontend, sfm=replace(frontend.sfm, distortion_rounds=0))
-    return build_priors(
-        views.images,
-        frontend,
-        generator=child_generator(seed, "frontend"),
-        feature_images=views.detail_images,
-        known_intrinsics_px=None if known is None else known.intrinsics_px,
-        known_world_from_cam=None if known is None else known.world_from_cam,
-        names=[record.name for record in views.records],
-        optics=optics_of(views),
-        valid=views.valid,
-    )
-
-
-def initial_state(
-    scene: Scene,
-    loaded: LoadedModel,
-    frontend: FrontendConfig,
-    warmup: WarmupConfig,
-    *,
-    seed: int,
-    on_step: Callable[[int, float], None] | None = None,
-) -> tuple[ExpansionState, Reconstruction, SparseReconstruction | None, WarmupReport | None]:
-    """Round 0: the captured views, their geometry, theta_0 (after the optional warm-up), and what the model makes of them.
-
-    The state's views are pinhole pictures: what the lens bent is straightened, here and for all that follows.
-    """
-    priors, sparse = views_priors(scene.views, loaded, frontend, seed=seed, known=scene.known)
-    views = scene.views
-    if sparse is not None:
-        views = straighten_views(views, sparse)
-        announce_cameras(report_cameras(views, sparse), strict=frontend.strict)
-    loaded.reset()
-    report = warm_up(
-        loaded.model,
-        views.images.to(loaded.device),
-        _device_priors(priors, loaded),
-        warmup,
-        seed=seed,
-        on_step=on_step,
-    )
-    weights = WeightsChange.between(loaded.base, loaded.state())
-    state = ExpansionState(views=views, priors=priors, weights=weights, known=scene.known)
-    return state, reconstruct(state.views, priors, loaded, weights, method="captured"), sparse, report
-
-
-@torch.no_grad()
-def predict(views: ViewSet, priors: Priors, loaded: LoadedModel, weights: WeightsChange) -> Prediction:
-    """All heads on the views, with the given weights."""
-    loaded.apply(weights)
-    return loaded.model.predict(
-        views.images.to(loaded.device), _device_priors(priors, loaded), generated=views.generated.to(loaded.device)
-    )
-
-
-def reconstruct(
-    views: ViewSet, priors: Priors, loaded: LoadedModel, weights: WeightsChange, *, method: str
-) -> Reconstruction:
-    """A reconstruction artefact of the views."""
-    return as_reconstruction(
-        predict(views, priors, loaded, weights),
-        views,
-        priors,
-        method=method,
-        model=loaded.model.name,
-        weights_sha256=loaded.fingerprint(weights),
-    )
-
-
-def captured_prediction(state: ExpansionState, loaded: LoadedModel) -> tuple[Anchors, Reconstruction]:
-    """Eq. (anchor_ref): what the model believed before the insertion; as anchors and as a reconstruction.
-
-    The views of the state are all views so far: from round 2 on, those inserted before are anchored too (and stay marked as generated).
-    """
-    reconstruction = reconstruct(state.toned_views, state.priors, loaded, state.weights, method="captured")
-    anchors = Anchors(
-        weights_sha256=reconstruction.weights_sha256,
-        view_ids=reconstruction.view_ids,
-        camera_vector=reconstruction.camera_vector,
-        depth=reconstruction.depth,
-        depth_conf=reconstruction.depth_conf,
-        normals=reconstruction.normals,
-        normals_conf=reconstruction.normals_conf,
-    )
-    return anchors, reconstruction
-
-
-def joint_reconstruction(
-    state: ExpansionState,
-    inserted: InsertedView,
-    loaded: LoadedModel,
-    frontend: FrontendConfig,
-    *,
-    seed: int,
-) -> tuple[Priors, Reconstruction, SparseReconstruction | None]:
-    """The baseline: the unadapted model given all views as they are, the inserted one last and treated like any other.
-
-    In every round: its weights are those of round 0, and no picture is in another tone. The priors come back in the frame and scale of
-    the state's, so that what was known before can be compared with them; the front-end's own findings are in their own scale.
-    """
-    views = state.views.append(inserted.view)
-    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known)
-    priors = in_gauge_of(state.priors, priors)
-    if sparse is not None:
-        announce_cameras(
-            report_cameras(views, sparse), strict=False
-        )  # a generated view may be left out: that is a result
-    return priors, reconstruct(views, priors, loaded, state.unadapted, method="backbone"), sparse
 
 
 def adapt_round(
@@ -302,8 +169,8 @@ def adapted_weights(
             captured=state.toned_views.images.to(loaded.device),
             inserted=inputs.inserted_view.images[0].to(loaded.device),
             anchors=_device_anchors(inputs.anchors, loaded),
-            captured_priors=_device_priors(state.priors, loaded),
-            joint_priors=_device_priors(inputs.joint_priors, loaded),
+            captured_priors=device_priors(state.priors, loaded),
+            joint_priors=device_priors(inputs.joint_priors, loaded),
         ),
         config,
         seed=seed,
@@ -343,7 +210,7 @@ def finished_round(
             loaded.model,
             views.images.to(loaded.device),
             views.generated.to(loaded.device),
-            _device_priors(joint_priors, loaded),
+            device_priors(joint_priors, loaded),
             config,
             seed=seed,
         )
@@ -365,39 +232,6 @@ def _joined(before: ViewSet | None, new: ViewSet | None) -> ViewSet | None:
     if before is None or new is None:
         return before if new is None else new
     return before.append(new)
-
-
-def refined(
-    reconstruction: Reconstruction,
-    views: ViewSet,
-    config: RefineConfig,
-    *,
-    doubt_generated: bool,
-    seed: int,
-    device: torch.device | str = "cpu",
-    on_step: Callable[[int, float], None] | None = None,
-) -> tuple[Reconstruction, RefineReport | None]:
-    """The reconstruction with its Gaussians fitted to the pictures they were made from, see `refine`.
-
-    With ``doubt_generated`` a generated picture is believed where no captured view sees the place or one agrees (`pixel_trust`);
-    otherwise it counts like a photo, as for the baseline, which does not know better. Pixels that do not show the place count nothing.
-    """
-    weights = None
-    if config.visits and doubt_generated and bool(reconstruction.generated.any()):
-        weights = pixel_trust(reconstruction, views.images)
-    if views.valid is not None:
-        shown = views.valid.to(reconstruction.depth)
-        weights = shown if weights is None else weights * shown
-    return refine(
-        reconstruction,
-        views.images,
-        config,
-        photos=views.photos,
-        weights=weights,
-        seed=seed,
-        device=device,
-        on_step=on_step,
-    )
 
 
 def refined_round(
@@ -475,10 +309,6 @@ def _photo_error(prediction: Prediction, views: ViewSet, compared: Bool[Tensor, 
     poses, intrinsics = prediction.world_from_cam[captured], prediction.intrinsics_px[captured]
     shown = render(prediction.gaussians, poses, intrinsics, views.height, views.width).rgb.clamp(0, 1)
     return float((shown.cpu() - views.images[captured]).square().mean())
-
-
-def _device_priors(priors: Priors, loaded: LoadedModel) -> Priors | None:
-    return priors.to(loaded.device) if loaded.uses_front_end else None
 
 
 def _device_anchors(anchors: Anchors, loaded: LoadedModel) -> Anchors:

@@ -80,8 +80,7 @@ def check_round(
         UserError: the back-end cannot serve the round, or the picture is unusable.
     """
     forecast = make_generator(generator).check(context)
-    own = isinstance(choice.candidate, str) and choice.candidate != AUTO
-    if not forecast.stored and not own:
+    if not forecast.stored and choice.named_file(context.round_number) is None:
         return forecast, None
     assessed = [assess(item, context.captured, choice.fit) for item in _with_own(context, forecast.stored, choice)]
     chosen = _picked(assessed, choice, context)
@@ -92,9 +91,8 @@ def _with_own(
     context: GenerationContext, candidates: Sequence[Candidate], choice: ChoiceConfig
 ) -> tuple[Candidate, ...]:
     """The candidates, followed by the user's own picture if that is the choice."""
-    if isinstance(choice.candidate, int) or choice.candidate == AUTO:
-        return tuple(candidates)
-    return (*candidates, own_picture(choice.candidate, context, where="choose.candidate"))
+    own = choice.named_file(context.round_number)
+    return tuple(candidates) if own is None else (*candidates, own_picture(own, context, where="choose.candidate"))
 
 
 def _picked(assessed: Sequence[Assessed], choice: ChoiceConfig, context: GenerationContext) -> int:

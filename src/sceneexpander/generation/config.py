@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 from sceneexpander.errors import UserError
@@ -22,6 +24,10 @@ class GeneratorConfig:
     """
 
     backend: str
+
+    def named_file(self, round_number: int) -> Path | None:
+        """The file outside of the scene folder that a round's picture depends on; None if there is none, or none is named."""
+        return None
 
     @classmethod
     def family(cls) -> tuple[str, Mapping[str, type]]:
@@ -83,3 +89,14 @@ class ChoiceConfig:
             raise UserError("is empty", where="choose.candidate", fix="use auto, a number from 0, or a file")
         if self.fit not in FITS:
             raise UserError(f"is {self.fit!r}", where="choose.fit", fix=f"use one of: {', '.join(FITS)}")
+
+    def named_file(self, round_number: int) -> Path | None:
+        """The user's own picture; None where a candidate is taken."""
+        own = isinstance(self.candidate, str) and self.candidate != AUTO
+        return picture_path(str(self.candidate), round_number) if own else None
+
+
+def picture_path(given: str, round_number: int) -> Path:
+    """A path as a user writes it: ``{round}`` filled unless that is in the file's own name, ``~`` written out."""
+    named = given if os.path.isfile(given) else given.replace("{round}", str(round_number))
+    return Path(os.path.expanduser(named))  # unlike Path's own, no error for a "~name" that is nobody's home

@@ -52,10 +52,11 @@ def resolve_weights(
     Raises:
         UserError: if there is no such file, or it is not a whole safetensors file.
     """
+    local = named_file(spec)
     if spec == BUILTIN:
         path = _builtin(model)
-    elif spec.endswith(".safetensors") or _is_there(Path(spec)):
-        path = Path(spec)
+    elif local is not None:
+        path = local
     elif HUB_ID.fullmatch(spec):
         path = _from_hub(spec, hub_file, allow_download)
     elif HUB_ID_WITHOUT_REVISION.fullmatch(spec):
@@ -66,6 +67,13 @@ def resolve_weights(
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return ResolvedWeights(spec=spec, path=path, sha256=digest)
+
+
+def named_file(spec: str | None) -> Path | None:
+    """The local file that a weights spec means; None for weights that ship with the package, those of a hub, and no spec."""
+    if spec is None or spec == BUILTIN:
+        return None
+    return Path(spec) if spec.endswith(".safetensors") or _is_there(Path(spec)) else None
 
 
 def _is_there(path: Path) -> bool:

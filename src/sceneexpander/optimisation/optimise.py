@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.store import sha256_of_tensors, to_plain
 from sceneexpander.evaluation.image import WINDOW, similarity
 from sceneexpander.geometry.camera import camera_vector_from_pose
 from sceneexpander.geometry.normals import normals_from_depth
@@ -285,8 +287,12 @@ def _run_key(
     config: OptimiseConfig,
     seed: int,
 ) -> str:
-    digest = hashlib.sha256(f"{config!r}:{seed}".encode())
-    given = [images, start.gaussians.means, start.gaussians.sh, start.world_from_cam, *(photos or ())]
-    for value in given if valid is None else [*given, valid]:
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    """Hash of everything that determines an optimisation."""
+    values = {f"start/{item.name}": getattr(start, item.name) for item in fields(start) if item.name != "gaussians"}
+    values |= {f"gaussians/{item.name}": getattr(start.gaussians, item.name) for item in fields(start.gaussians)}
+    values |= {"images": images, "valid": valid}
+    values |= {f"photos/{index}": photo for index, photo in enumerate(photos or ())}
+    tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
+    facts = {name: value for name, value in values.items() if name not in tensors}
+    settings = json.dumps(to_plain({"config": config, "seed": seed, "facts": facts}), sort_keys=True)
+    return hashlib.sha256(f"{sha256_of_tensors(tensors)}:{settings}".encode()).hexdigest()

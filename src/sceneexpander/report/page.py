@@ -210,7 +210,8 @@ def _view_groups(
 def _view_number(view: ViewMetrics | None) -> str:
     if view is None:
         return ""
-    return f"{view.psnr_db:.2f} dB" if view.posed else f"no camera ({view.psnr_db:.2f} dB at a placeholder)"
+    psnr = view.psnr_db if view.own is None or view.own.psnr_db is None else view.own.psnr_db
+    return f"{psnr:.2f} dB" if view.posed else f"no camera ({psnr:.2f} dB at a placeholder)"
 
 
 def _facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:

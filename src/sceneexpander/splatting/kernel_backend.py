@@ -1,7 +1,7 @@
 """The compiled CPU rasteriser behind `torch.autograd.Function`.
 
 The library is found beside the sources (the install builds it, see ``setup.py``), one per x86-64 level; it has a plain C
-ABI, so it depends on no version of torch or Python.
+ABI, so it depends on no version of torch or Python. It carries the hash of what it was built from, and one of another source is refused.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sceneexpander.errors import UserError
+from sceneexpander.splatting.kernel import recipe
 from sceneexpander.splatting.scene import RasterScene
 
 logger = logging.getLogger(__name__)
 
 ABI_VERSION = 2
-KERNEL_DIRECTORY = Path(__file__).parent / "kernel"
+KERNEL_DIRECTORY = recipe.SOURCE.parent
 # Builds by what the CPU can do, best first.
 BUILDS = {"AVX512": ("v4", "v3", "plain"), "AVX2": ("v3", "plain")}
 
@@ -53,9 +55,10 @@ class _Gradients(ctypes.Structure):
 class _Kernel:
     """The functions of one loaded library."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, build: str) -> None:
         library = ctypes.CDLL(str(path))
-        self.path = path
+        self.path, self.build = path, build
+        _require_own_source(library, path, build)
         if library.sx_abi_version() != ABI_VERSION:
             raise OSError(f"{path.name} has ABI {library.sx_abi_version()}, expected {ABI_VERSION}: install again")
         self.max_channels = int(library.sx_max_channels())
@@ -68,6 +71,21 @@ class _Kernel:
         self.free = library.sx_free
         self.free.restype = None
         self.free.argtypes = [ctypes.c_void_p]
+
+
+def _require_own_source(library: ctypes.CDLL, path: Path, build: str) -> None:
+    """Raise `UserError` unless the library was built from the source beside it: results would belong to no code that there is."""
+    carried = "none"  # of libraries before they carried one
+    if hasattr(library, "sx_source_hash"):
+        library.sx_source_hash.restype = ctypes.c_char_p
+        carried = library.sx_source_hash().decode()
+    expected = recipe.source_hash(build)
+    if carried != expected:
+        raise UserError(
+            f"was built from another source (it carries the hash {carried[:12]}, {recipe.SOURCE.name} and its flags have {expected[:12]})",
+            where=path,
+            fix="build it again: make setup, or pip install --no-deps --no-build-isolation -e .",
+        )
 
 
 class _ViewState:
@@ -94,11 +112,21 @@ def load_kernel() -> _Kernel | None:
     return None
 
 
+def kernel_build() -> str:
+    """Which build of the kernel draws on this machine (a name in `BUILDS`); "torch" where none does."""
+    kernel = load_kernel()
+    return "torch" if kernel is None else kernel.build
+
+
 def open_build(build: str) -> _Kernel | None:
-    """One of the libraries that the install may have built (a name in `BUILDS`); the CPU must know its instructions."""
+    """One of the libraries that the install may have built (a name in `BUILDS`); the CPU must know its instructions.
+
+    Raises:
+        UserError: it was built from another source than the one beside it.
+    """
     for path in sorted(KERNEL_DIRECTORY.glob(f"_rasteriser_{build}.*")):
         try:
-            return _Kernel(path)
+            return _Kernel(path, build)
         except (OSError, AttributeError) as error:
             logger.warning("rasteriser: cannot use %s (%s)", path.name, error)
     return None

@@ -5,7 +5,8 @@ the pixel (its alpha times what light is left in front of it). Gaussians are ord
 that enter no pixel go first. Any prefix of the packed order is therefore the best set of its size.
 
 How many: a surface that one view alone shows needs all its Gaussians, so too few leave holes there. The number grows until every one
-of the reconstruction's own views looks like that of all Gaussians (`FAITHFUL_DB`), or the page would become too large.
+of the reconstruction's own views looks like that of all Gaussians (`FAITHFUL_DB`) and stays as closed (`MOST_OPENED`), at the size of a
+window and not of the stored pictures, or the page would become too large.
 
 Layout of `PackedSplats.data`, column after column, little-endian, ``count`` rows each:
 
@@ -23,6 +24,7 @@ generated             u8      1 if it comes from a generated view
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +35,7 @@ from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import load_artifact, load_fields, refusing, save_artifact
+from sceneexpander.geometry.camera import resize_intrinsics
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.splatting import RasterSettings, rasterise, render
@@ -42,7 +45,10 @@ from sceneexpander.viewer.cameras import Cameras
 SCHEMA = "packed-splats/3"
 SPLATS_PER_METHOD = 400_000  # at most: three methods stay below 30 MB of page
 FAITHFUL_DB = 33.0  # PSNR of the worst view against all Gaussians at which no more are added
-_FEWEST, _MORE = 150_000, 50_000  # where the search for the number begins, and its step
+MOST_OPENED = 0.002  # share of the worst view's pixels that may become open (alpha below 0.9) by what is left out
+_OPEN_ALPHA = 0.9
+_WINDOW = 2  # windows have about this many times the stored pixels a side
+_FEWEST, _MORE = 200_000, 100_000  # where the search for the number begins, and its step
 _EQUAL_DB = 100.0
 BYTES_PER_SPLAT = 18
 _CAMERA_TENSORS = ("generated", "posed", "world_from_cam", "intrinsics_px", "focus")
@@ -218,25 +224,28 @@ def _enough(
     reconstruction: Reconstruction, order: Int[Tensor, " gaussian"], limit: int, device: torch.device | str
 ) -> tuple[Int[Tensor, " kept"], float]:
     """(the shortest tried prefix of ``order`` whose views are faithful, PSNR of its worst view)."""
-    height, width = reconstruction.depth.shape[1:]
+    height, width = (_WINDOW * int(side) for side in reconstruction.depth.shape[1:])
     scene = reconstruction.gaussians.detach().to(device)
-    poses, lenses = reconstruction.world_from_cam.to(device), reconstruction.intrinsics_px.to(device)
+    poses = reconstruction.world_from_cam.to(device)
+    lenses = resize_intrinsics(reconstruction.intrinsics_px.to(device), _WINDOW, _WINDOW)
 
-    def pictures(gaussians: Gaussians) -> list[Float[Tensor, "3 height width"]]:
-        cameras = zip(poses, lenses, strict=True)
-        return [render(gaussians, pose[None], lens[None], height, width).rgb[0].clamp(0, 1) for pose, lens in cameras]
+    def pictures(gaussians: Gaussians) -> Iterator[tuple[Tensor, Tensor]]:
+        for pose, lens in zip(poses, lenses, strict=True):
+            seen = render(gaussians, pose[None], lens[None], height, width)
+            yield seen.rgb[0].clamp(0, 1), seen.alpha[0] < _OPEN_ALPHA
 
-    wanted = pictures(scene)
+    wanted = list(pictures(scene))
     count = min(_FEWEST, limit)
     while True:
         kept = order[:count]
         if len(kept) == len(order):
             return kept, _EQUAL_DB
-        errors = [
-            float(((a - b) ** 2).mean()) for a, b in zip(pictures(scene.select(kept.to(device))), wanted, strict=True)
-        ]
+        errors, opened = [0.0], [0.0]
+        for (a, through), (b, was_open) in zip(pictures(scene.select(kept.to(device))), wanted, strict=True):
+            errors.append(float(((a - b) ** 2).mean()))
+            opened.append(float((through & ~was_open).double().mean()))
         worst = min(_EQUAL_DB, -10 * math.log10(max(*errors, 1e-12)))
-        if worst >= FAITHFUL_DB or count >= limit:
+        if (worst >= FAITHFUL_DB and max(opened) <= MOST_OPENED) or count >= limit:
             return kept, worst
         count = min(count + _MORE, limit)
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+from sceneexpander.packages import LOCKS
 from stages import layout
 from stages.fingerprint import stage_names
 
@@ -56,7 +57,15 @@ def filled(path: str) -> str:
 @pytest.mark.parametrize(
     ("stage", "written"),
     [
-        ("resolve", [layout.config("S"), layout.selection("S")]),
+        ("code", [layout.CODE, layout.ENVIRONMENT]),
+        (
+            "resolve",
+            [
+                layout.config("S"),
+                layout.selection("S"),
+                *(layout.given("S", kind) for kind in ("generator", "choice", "model", *layout.RIVALS)),
+            ],
+        ),
         ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
         ("reconstruct", [layout.state("S", 0), layout.statistics("reconstruct", "S")]),
         ("generate_view", [layout.candidates("S", 2), layout.statistics("generate_view", "S", 2)]),
@@ -115,16 +124,22 @@ def test_outputs_are_where_the_layout_says(stage: str, written: list[Path]) -> N
     assert declared == {path.as_posix() for path in written}
 
 
-def test_resume_points_are_no_outputs_and_nothing_persists_but_the_marker() -> None:
-    persistent = [
-        (stage, path)
-        for stage, content in PIPELINE.items()
+def test_nothing_persists_but_what_belongs_to_this_machine() -> None:
+    persistent = {
+        filled(path)
+        for content in PIPELINE.values()
         for item in content.get("outs", [])
         if isinstance(item, dict)
         for path, options in item.items()
         if options.get("persist")
-    ]
-    assert persistent == [("track", "mlflow/tracked.json")]
+    }
+    given = {layout.given("S", kind).as_posix() for kind in ("generator", "choice", "model", *layout.RIVALS)}
+    # Never restored from the cache of runs (another machine's environment), never copied into it (links to the user's files).
+    assert persistent == {"mlflow/tracked.json", layout.CODE.as_posix(), layout.ENVIRONMENT.as_posix()} | given
+
+
+def test_code_depends_on_the_locks() -> None:
+    assert set(paths("code", "deps")) == {"src", "stages", *LOCKS}
 
 
 def test_selected_methods_exist() -> None:

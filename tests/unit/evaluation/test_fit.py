@@ -8,11 +8,12 @@ import pytest
 
 from sceneexpander.artifacts.metrics import Fit, MetricsRow
 from sceneexpander.artifacts.store import write_json_atomic
+from sceneexpander.evaluation import EvaluateConfig, evaluate
 from sceneexpander.selection import METHODS, OPTIMISABLE, OURS, RIVALS
 from stages import layout
 from stages.evaluate import fit_of
 from stages.runner import Cell
-from tests.unit.evaluation.test_table import row
+from tests.unit.evaluation.made import made_reconstruction, own_pictures
 
 
 @pytest.mark.parametrize(
@@ -42,6 +43,7 @@ def test_only_methods_that_optimise_need_no_mark_for_it() -> None:
 
 
 def test_it_is_kept_with_the_numbers(tmp_path: Path) -> None:
-    fitted = row("a", "backbone", 18.0, fit=Fit.FITTED)
-    fitted.save(tmp_path / "row.json")
+    scene = made_reconstruction()
+    made = evaluate(scene, own_pictures(scene), EvaluateConfig(), scene="m", round_number=1, seed=0, fit=Fit.FITTED)
+    made.save(tmp_path / "row.json")
     assert MetricsRow.load(tmp_path / "row.json").fit is Fit.FITTED

@@ -156,3 +156,8 @@ def test_markdown() -> None:
     text = comparison_table([row("a", "odd|name", 25.0)]).markdown().splitlines()
     assert text[1].startswith("| :-- | --: | --: |")
     assert text[2].startswith("| odd\\|name | as predicted | 1 | 25.00 |")
+
+
+def test_what_the_scene_before_the_insertion_shows_of_an_inserted_view_is_no_number() -> None:
+    table = comparison_table([row("a", "captured", 25.0, inserted_psnr_db=9.0)])
+    assert "insertion PSNR ↑" not in table.header

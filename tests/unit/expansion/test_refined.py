@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sceneexpander.expansion.rounds import refined
 from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.reconstruction.refining import refined
 from tests.unit.evaluation.made import own_pictures
 from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
 

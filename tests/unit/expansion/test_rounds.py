@@ -155,7 +155,7 @@ def test_omnivggt_as_the_reconstructor_is_told_what_the_front_end_found(
         images = tiny_images(count, 28, 42, seed=start + 1)
         return replace(small(count, generated=generated, start=start), images=images, detail_images=images)
 
-    monkeypatch.setattr("sceneexpander.expansion.rounds.build_priors", found)
+    monkeypatch.setattr("sceneexpander.reconstruction.views.build_priors", found)
     monkeypatch.setattr("tests.unit.expansion.test_rounds.make_views", views)
     results = {}
     for use in PriorsUse:

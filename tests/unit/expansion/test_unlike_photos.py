@@ -15,11 +15,11 @@ import torch
 from PIL import Image
 
 from sceneexpander.errors import UserError
-from sceneexpander.expansion.cameras import announce_cameras, report_cameras, straighten_views
-from sceneexpander.expansion.optics import optics_of
 from sceneexpander.frontend.sfm import estimate_cameras
 from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig, SparseReconstruction
 from sceneexpander.ingest import IngestConfig, read_views
+from sceneexpander.reconstruction.cameras import announce_cameras, report_cameras, straighten_views
+from sceneexpander.reconstruction.optics import optics_of
 
 SCENE = Path(__file__).parents[3] / "scenes" / "courtyard"
 CONFIG = SfmConfig(learned=LearnedUse.NEVER)

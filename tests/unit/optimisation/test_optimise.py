@@ -17,7 +17,7 @@ from sceneexpander.geometry.camera import project_points
 from sceneexpander.geometry.gaussians import ROWS
 from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
 from sceneexpander.optimisation.config import DensityConfig, OptimiseConfig, RatesConfig
-from sceneexpander.optimisation.optimise import optimise, photometric_loss, scene_extent, unusable
+from sceneexpander.optimisation.optimise import _run_key, optimise, photometric_loss, scene_extent, unusable
 from tests.unit.evaluation.made import made_reconstruction, own_pictures
 
 TRUTH = made_reconstruction()
@@ -202,3 +202,23 @@ def test_the_loss_is_nothing_for_the_picture_itself_and_its_gradient_is_right() 
         return photometric_loss(picture, small.flip(-1), 0.7)
 
     assert torch.autograd.gradcheck(loss, (small.clone().requires_grad_(),), eps=1e-6, atol=1e-5)
+
+
+def test_the_key_of_resume_points_covers_every_tensor() -> None:
+    start = spoiled()
+
+    def others(owner: object) -> list[dict[str, Tensor]]:
+        """Another value for each tensor of ``owner``, one at a time."""
+        values = {f.name: getattr(owner, f.name) for f in fields(owner)}  # type: ignore[arg-type]
+        tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
+        return [{name: ~v if v.dtype == torch.bool else v * 2 + 1} for name, v in tensors.items()]
+
+    variants = [start, *(replace(start, **other) for other in others(start))]
+    variants += [replace(start, gaussians=replace(start.gaussians, **other)) for other in others(start.gaussians)]
+    keys = {_run_key(variant, VIEWS.images, None, OptimiseConfig(), 0) for variant in variants}
+    keys |= {_run_key(start, VIEWS.images / 2, None, OptimiseConfig(), 0)}
+    keys |= {_run_key(start, VIEWS.images, start.depth > 0, OptimiseConfig(), 0)}
+    keys |= {_run_key(start, VIEWS.images, None, OptimiseConfig(steps=7), 0)}
+    keys |= {_run_key(start, VIEWS.images, None, OptimiseConfig(), 1)}
+    assert len(keys) == len(variants) + 4
+    assert _run_key(spoiled(), VIEWS.images.clone(), None, OptimiseConfig(), 0) in keys

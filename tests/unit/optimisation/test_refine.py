@@ -6,9 +6,14 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from torch.nn import functional
 
+from sceneexpander.artifacts.views import to_bytes
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.image import psnr
+from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.sampling import BAND_LIMIT_PX, finest_pixel
 from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.optimisation.optimise import photometric_loss
 from sceneexpander.optimisation.refine import refine
@@ -103,3 +108,46 @@ def test_bad_settings_are_named() -> None:
         RefineConfig(colours=-1.0)
     with pytest.raises(ValueError, match="do not fit"):
         refine(TRUTH, IMAGES[..., :-1], CONFIG, seed=0)
+
+
+def test_dark_surfaces_become_solid_and_not_transparent() -> None:
+    faint = replace(TRUTH, gaussians=replace(TRUTH.gaussians, opacities=0.5 * TRUTH.gaussians.opacities))
+    result, report = refine(faint, 0 * IMAGES, replace(CONFIG, visits=30), seed=0)
+    assert report is not None
+    assert report.accepted
+    seen = render(result.gaussians, TRUTH.world_from_cam, TRUTH.intrinsics_px, *IMAGES.shape[2:])
+    # Against a black background a picture without anything in it would be as good.
+    assert float((seen.alpha[:, 3:-3, 3:-3] > 0.9).double().mean()) > 0.99
+    assert float(seen.rgb.mean()) < 0.05
+
+
+def test_nothing_gets_narrower_than_the_finest_view_resolves() -> None:
+    dust = replace(TRUTH, gaussians=replace(TRUTH.gaussians, scales=0.05 * TRUTH.gaussians.scales))
+    photos = [to_bytes(functional.interpolate(image[None], scale_factor=2)[0]) for image in IMAGES]
+    height, width = IMAGES.shape[2:]
+    lens = resize_intrinsics(TRUTH.intrinsics_px, 2, 2)
+    for given, lenses, size in ((None, TRUTH.intrinsics_px, (height, width)), (photos, lens, (2 * height, 2 * width))):
+        result, report = refine(dust, IMAGES, replace(CONFIG, visits=12, colours=0.01), photos=given, seed=0)
+        assert report is not None
+        assert report.accepted
+        pixel = finest_pixel(dust.gaussians.means, TRUTH.world_from_cam, lenses, [size] * len(IMAGES))
+        assert bool((result.gaussians.scales >= 0.999 * BAND_LIMIT_PX * pixel[:, None]).all())
+        assert result.gaussians.antialiased
+
+
+def test_what_only_the_photos_show_is_fitted() -> None:
+    height, width = IMAGES.shape[2:]
+    fine = functional.interpolate(IMAGES, scale_factor=2, mode="bilinear")
+    # Stripes that are even grey at the stored size.
+    fine = (fine + 0.3 * ((torch.arange(2 * width) + 1) // 2 % 2 * 2 - 1)).clamp(0, 1)
+    stored = functional.avg_pool2d(fine, 2)
+    photos = [to_bytes(image) for image in fine]
+    lens = resize_intrinsics(TRUTH.intrinsics_px, 2, 2)
+
+    def own(gaussians: Gaussians) -> float:
+        seen = render(gaussians, TRUTH.world_from_cam[:1], lens[:1], 2 * height, 2 * width)
+        return psnr(seen.rgb[0], fine[0])
+
+    without, _ = refine(spoiled(), stored, CONFIG, seed=0)
+    given, _ = refine(spoiled(), stored, CONFIG, photos=photos, seed=0)
+    assert own(given.gaussians) > own(without.gaussians) + 0.3

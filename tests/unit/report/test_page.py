@@ -15,7 +15,7 @@ from PIL import Image
 from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.adaptation.observe import Look
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
-from sceneexpander.artifacts.metrics import Fit, MetricsRow, UnavailableRow
+from sceneexpander.artifacts.metrics import Fit, MetricsRow, SizeMetrics, UnavailableRow
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
@@ -91,6 +91,8 @@ def row(method: str, psnr: float) -> MetricsRow:
         ssim=0.5,
         coverage=1.0,
         inserted_psnr_db=None if method == "captured" else psnr / 2,
+        own=SizeMetrics(open_share=0.25, psnr_db=psnr - 1, ssim=0.4),
+        inserted_own=None if method == "captured" else SizeMetrics(open_share=0.25, psnr_db=psnr / 2 - 1),
     )
 
 
@@ -234,8 +236,13 @@ def test_it_says_what_rows_and_columns_mean_and_what_went_wrong(page: Path) -> N
     assert "SceneExpander on mini" in html
     assert "WorldMirror" not in html
     assert "ceiling" not in html, "fitted Gaussians show the photos better than the scene before the insertion"
-    shown = [item for _, table in TABLES for item in table if item.name in {"psnr_db", "ssim", "inserted_psnr_db"}]
-    assert len(shown) == 3
+    shown = [
+        item
+        for _, table in TABLES
+        for item in table
+        if item.name in {"psnr_db", "own.psnr_db", "own.open_share", "inserted_psnr_db"}
+    ]
+    assert len(shown) == 4
     for item in shown:
         assert item.meaning.split(":")[0] in html
         assert f'>{item.heading}<span class="arrow">' in html
@@ -254,14 +261,14 @@ def test_a_method_that_could_not_be_run_says_why_where_its_numbers_would_be(page
 def test_every_number_has_its_name_and_its_unit_for_narrow_screens(page: Path) -> None:
     table = page.read_text().split("<tbody>")[1].split("</tbody>")[0]
     cells = re.findall(r'data-label="([^"]*)"><span>([^<]*)(?:<span class="unit"> (\w+)</span>)?', table)
-    assert ("PSNR \u2191", "22.00", "dB") in cells
-    assert ("SSIM \u2191", "0.500", "") in cells
+    assert ("PSNR \u2191", "21.00", "dB") in cells
+    assert ("SSIM \u2191", "0.400", "") in cells
 
 
 def test_bold_compares_methods_with_the_inserted_view(page: Path) -> None:
     table = page.read_text().split("<tbody>")[1].split("</tbody>")[0]
     bold = re.findall(r'<td class="best"[^>]*><span>([^<]+)<', table)
-    assert "22.00" in bold
+    assert "21.00" in bold
     assert "20.00" not in bold, "the scene before the insertion is no competitor"
 
 
@@ -400,7 +407,7 @@ def test_runs_to_track_come_from_the_same_folder(gathered: Path, tmp_path: Path)
     assert adapted.curves["4_loss/inserted_depth"] == [(2, 0.5)], "zero is no loss where there is nothing to lose"
     assert not runs["backbone"].curves
     assert adapted.metrics["1_quality/psnr_captured_db"] == 22.0
-    assert "PSNR **22.00 dB**; Inserted PSNR **11.00 dB**." in adapted.tags["mlflow.note.content"]
+    assert "PSNR **21.00 dB**; Inserted PSNR **10.00 dB**." in adapted.tags["mlflow.note.content"]
     assert "is blurred" in adapted.tags["mlflow.note.content"]
     assert adapted.params["adapt.steps"] == "3"
     assert adapted.tags["reconstructor"] == "mini"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +12,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from sceneexpander.errors import UserError
 from sceneexpander.splatting import RasterSettings, kernel_backend, render
+from sceneexpander.splatting.kernel import recipe
 from sceneexpander.splatting.rasterise import active_backend
 from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
 
 ROOT = Path(__file__).parents[3]
+KERNEL = "src/sceneexpander/splatting/kernel"
+LOCKS = ("requirements.lock", "requirements-nodeps.lock")
 
 
 def test_a_broken_compiler_does_not_fail_the_build(tmp_path: Path) -> None:
@@ -62,6 +67,50 @@ def test_a_library_that_does_not_load_is_passed_over(
     (tmp_path / "_rasteriser_v3.so").write_bytes(b"not a library")
     assert kernel_backend.open_build("v3") is None
     assert "cannot use _rasteriser_v3.so" in caplog.text
+
+
+def test_a_library_of_another_source_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if kernel_backend.load_kernel() is None:
+        pytest.skip("no compiled kernel (no compiler at install)")
+    edited = tmp_path / "rasteriser.cpp"
+    edited.write_text(recipe.SOURCE.read_text().replace("kMinTransmittance = 1e-4f", "kMinTransmittance = 2e-4f"))
+    monkeypatch.setattr(recipe, "SOURCE", edited)
+    kernel_backend.load_kernel.cache_clear()
+    try:
+        with pytest.raises(UserError, match=r"_rasteriser_.*built from another source.*make setup") as refused:
+            render(random_gaussians(5), cameras(1), intrinsics(1, 8, 8), 8, 8)
+        assert "\n" not in refused.value.line()
+    finally:
+        monkeypatch.undo()
+        kernel_backend.load_kernel.cache_clear()
+
+
+def test_another_flag_is_another_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = recipe.source_hash("v3")
+    monkeypatch.setattr(recipe, "FLAGS", [*recipe.FLAGS, "-ffast-math"])
+    assert recipe.source_hash("v3") != before
+
+
+@pytest.mark.parametrize("edited", ["setup.py", *(f"{KERNEL}/{name}" for name in ("rasteriser.cpp", "recipe.py"))])
+def test_an_edit_of_what_the_library_is_made_from_installs_again(edited: str, tmp_path: Path) -> None:
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    for name in (
+        *LOCKS,
+        "pyproject.toml",
+        "setup.py",
+        f"{KERNEL}/rasteriser.cpp",
+        f"{KERNEL}/recipe.py",
+        ".venv/.stamp",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+
+    def commands(*options: str) -> str:
+        make = ["make", "-n", *options, "setup"]
+        return subprocess.run(make, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+
+    assert "pip install" not in commands()
+    assert "pip install" in commands("-W", edited)
 
 
 def test_the_library_in_use_is_named_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -10,7 +10,7 @@ from sceneexpander.artifacts.candidates import Candidate, CandidateSet
 from sceneexpander.artifacts.inserted import Provenance
 from sceneexpander.artifacts.store import sha256_of_bytes
 from sceneexpander.errors import UserError
-from sceneexpander.generation.config import GeneratorConfig
+from sceneexpander.generation.config import GeneratorConfig, picture_path
 from sceneexpander.generation.prompt import fill_prompt
 from sceneexpander.generation.protocol import Forecast, GenerationContext, SceneSoFar
 from sceneexpander.ingest.decode import LIMIT_BYTES
@@ -62,6 +62,10 @@ class FileConfig(GeneratorConfig):
     backend: str = "file"
     file: str | None = None
 
+    def named_file(self, round_number: int) -> Path | None:
+        """The picture."""
+        return picture_path(self.file, round_number) if self.file else None
+
 
 @dataclass(frozen=True, slots=True)
 class FileGenerator:
@@ -71,9 +75,10 @@ class FileGenerator:
 
     def check(self, context: GenerationContext) -> Forecast:
         """The one picture. Relative paths start at the working directory. See `ViewGenerator`."""
-        if not self.config.file:
+        path = self.config.named_file(context.round_number)
+        if path is None:
             raise UserError("is not set", where="generator.file", fix="give the path of your picture")
-        picture = own_picture(self.config.file, context, where="generator.file")
+        picture = own_picture(path, context, where="generator.file")
         return Forecast(prompt=fill_prompt(context.spec), stored=(picture,))
 
     def generate(self, context: GenerationContext, so_far: SceneSoFar) -> CandidateSet:
@@ -81,10 +86,8 @@ class FileGenerator:
         return CandidateSet(round=context.round_number, candidates=self.check(context).stored)
 
 
-def own_picture(given: str, context: GenerationContext, *, where: str) -> Candidate:
-    """The picture at a path that the user set, ``{round}`` in it filled. Raises `UserError` if it is no file."""
-    named = given if os.path.isfile(given) else given.replace("{round}", str(context.round_number))
-    path = Path(os.path.expanduser(named))  # unlike Path's own, no error for a "~name" that is nobody's home
+def own_picture(path: Path, context: GenerationContext, *, where: str) -> Candidate:
+    """The picture at a path that the user set. Raises `UserError` if it is no file."""
     if os.path.isdir(path):
         raise UserError(f"{path} is a folder", where=where, fix="give the path of one picture")
     return stored_candidate(path, context, "file", folder=path.parent)

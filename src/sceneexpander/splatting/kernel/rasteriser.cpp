@@ -1207,6 +1207,7 @@ auto with_channels(int channels, const Fn& fn) {
 // ------------------------------------------------------------------------------------------------ entry points
 
 SX_API int32_t sx_abi_version() { return 2; }
+SX_API const char* sx_source_hash() { return SX_SOURCE_HASH; }  // of this file and the compiler's flags, see recipe.py
 SX_API int32_t sx_max_channels() { return 16; }
 
 // Renders planes [channels,H,W], transmittance [H,W] and radii [N] (pixels, 0: not seen). Returns the view's state for
