@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sceneexpander.errors import UserError, did_you_mean
+from sceneexpander.generation.backends.openai import OpenAIConfig, make_openai
 from sceneexpander.generation.backends.reproject import ReprojectConfig, ReprojectGenerator
 from sceneexpander.generation.backends.stored import FileConfig, FileGenerator, ReplayConfig, ReplayGenerator
 from sceneexpander.generation.config import GeneratorConfig
@@ -12,6 +13,7 @@ BACKENDS: dict[str, Backend] = {
     "replay": Backend(config=ReplayConfig, make=ReplayGenerator, takes_recorded=True),
     "file": Backend(config=FileConfig, make=FileGenerator),
     "reproject": Backend(config=ReprojectConfig, make=ReprojectGenerator),
+    "openai": Backend(config=OpenAIConfig, make=make_openai),
 }
 
 
