@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from sceneexpander.errors import UserError, did_you_mean
+from sceneexpander.generation.backends.comfyui import ComfyUIConfig, make_comfyui
+from sceneexpander.generation.backends.gemini import GeminiConfig, make_gemini
 from sceneexpander.generation.backends.openai import OpenAIConfig, make_openai
 from sceneexpander.generation.backends.reproject import ReprojectConfig, ReprojectGenerator
 from sceneexpander.generation.backends.stored import FileConfig, FileGenerator, ReplayConfig, ReplayGenerator
@@ -14,6 +16,8 @@ BACKENDS: dict[str, Backend] = {
     "file": Backend(config=FileConfig, make=FileGenerator),
     "reproject": Backend(config=ReprojectConfig, make=ReprojectGenerator),
     "openai": Backend(config=OpenAIConfig, make=make_openai),
+    "gemini": Backend(config=GeminiConfig, make=make_gemini),
+    "comfyui": Backend(config=ComfyUIConfig, make=make_comfyui),
 }
 
 
