@@ -25,7 +25,7 @@ def generation_context(cell: Cell) -> GenerationContext:
 
 
 def scene_so_far(cell: Cell) -> SceneSoFar:
-    """The views before the round, and what was reconstructed of them."""
+    """The views before the round, and what was reconstructed of them, its Gaussians fitted to them."""
     state = ExpansionState.load(layout.state(cell.scene, cell.previous))
-    reconstruction = Reconstruction.load(layout.reconstruction(cell.scene, cell.previous, "sceneexpander"))
+    reconstruction = Reconstruction.load(layout.reconstruction(cell.scene, cell.round, "captured"))
     return SceneSoFar(views=state.views, reconstruction=reconstruction, known=state.known)
