@@ -25,7 +25,7 @@ from sceneexpander.expansion import (
     load_model,
     refined_round,
 )
-from sceneexpander.generation import generate_inserted_view
+from sceneexpander.generation import GenerationContext, check_round
 from sceneexpander.ingest import load_scene
 from sceneexpander.splatting import render
 from sceneexpander.splatting.ply import write_ply
@@ -45,7 +45,17 @@ def expand_courtyard(overrides: Sequence[str]) -> tuple[Reconstruction, Reconstr
     anchors, _ = captured_prediction(state, loaded)
 
     # The picture beyond them, and where its camera is.
-    inserted, _ = generate_inserted_view(scene, 1, state.views, COURTYARD, config.generator)
+    request = GenerationContext(
+        scene_folder=COURTYARD,
+        scene=scene.name,
+        round_number=1,
+        spec=scene.round_spec(1),
+        captured=state.views,
+        cache=ROOT / ".cache",
+    )
+    _, inserted = check_round(request, config.generator, config.choose)
+    if inserted is None:
+        raise RuntimeError("the bundled scene brings its picture")
     priors, backbone, _ = joint_reconstruction(state, inserted, loaded, config.frontend, seed=config.seed)
 
     # Algorithm 1 between its corrections, then the fit of the Gaussians to the pictures.

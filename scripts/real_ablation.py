@@ -13,13 +13,12 @@ from pathlib import Path
 import torch
 
 from sceneexpander.adaptation.config import AdaptConfig
-from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet, save_png
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
-from sceneexpander.errors import entry_point
+from sceneexpander.errors import UserError, entry_point
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.expansion import (
@@ -31,7 +30,7 @@ from sceneexpander.expansion import (
     refined,
     refined_round,
 )
-from sceneexpander.generation import generate_inserted_view
+from sceneexpander.generation import GenerationContext, check_round
 from sceneexpander.ingest import load_scene
 from sceneexpander.project import find_project
 from sceneexpander.reconstruction.loaded import load_model
@@ -65,8 +64,17 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
     scene = load_scene(folder, config.scene)
     state, _, _, _ = initial_state(scene, loaded, config.frontend, config.warmup, seed=config.seed)
     anchors, captured = captured_prediction(state, loaded)
-    inserted: InsertedView
-    inserted, _ = generate_inserted_view(scene, 1, state.views, folder, config.generator)
+    context = GenerationContext(
+        scene_folder=folder,
+        scene=scene.name,
+        round_number=1,
+        spec=scene.round_spec(1),
+        captured=state.views,
+        cache=Path(".cache"),
+    )
+    _, inserted = check_round(context, config.generator, config.choose)
+    if inserted is None:
+        raise UserError("has no picture for round 1", where=folder, fix="record one in its scene.yaml")
     priors, backbone, _ = joint_reconstruction(state, inserted, loaded, config.frontend, seed=config.seed)
     inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
     views = state.views.append(inserted.view)

@@ -10,7 +10,7 @@ from sceneexpander.fingerprint import SourceTree
 from stages import layout
 from stages.runner import Cell, stage
 
-NOT_STAGES = frozenset({"__init__", "layout", "runner", "machine", "fingerprint", "check"})
+NOT_STAGES = frozenset({"__init__", "layout", "runner", "machine", "rounds", "fingerprint", "check"})
 
 
 def stage_names(folder: Path) -> list[str]:

@@ -39,7 +39,7 @@ def selection(scene: str) -> Path:
 def given(scene: str, kind: str) -> Path:
     """A folder of links to files that the configuration names, wherever they are: the pipeline depends on their bytes.
 
-    ``kind``: ``picture`` (a link per round), ``model`` (weights), or a rival's name (weights).
+    ``kind``: ``generator`` and ``choice`` (a link per round), ``model`` (weights), or a rival's name (weights).
     """
     return GIVEN / scene / kind
 
@@ -67,6 +67,11 @@ def reconstruction(scene: str, number: int, method: str) -> Path:
 def repeat_name(repeat: int) -> str:
     """Folder of one of a method's runs with different seeds: the first is the reconstruction, further ones lie beside it."""
     return REPEATS.replace("*", str(repeat)) if repeat else "reconstruction"
+
+
+def candidates(scene: str, number: int) -> Path:
+    """The `CandidateSet` of a round."""
+    return round_folder(scene, number) / "candidates"
 
 
 def inserted(scene: str, number: int) -> Path:

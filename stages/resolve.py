@@ -11,10 +11,10 @@ from sceneexpander.config.compose import compose, scene_option
 from sceneexpander.config.files import write_yaml
 from sceneexpander.config.overrides import written_out
 from sceneexpander.environment import usable_cpus
-from sceneexpander.generation.backends import picture_file
-from sceneexpander.generation.config import GeneratorConfig
+from sceneexpander.generation.config import ChoiceConfig, GeneratorConfig
 from sceneexpander.models.weights import named_file
 from sceneexpander.selection import read_selection
+from sceneexpander.typed import decode_dataclass
 from stages import layout
 from stages.runner import Cell, stage
 
@@ -36,10 +36,12 @@ def named_files(values: Mapping[str, Any], rounds: int) -> dict[str, dict[str, P
 
     Files that are not there are left out: the stage that needs one says so. Weights on a hub are named by their revision.
     """
-    generator = GeneratorConfig(**values["generator"])
-    pictures = {f"round_{number}": picture_file(generator, number) for number in range(1, rounds + 1)}
+    generator = decode_dataclass(GeneratorConfig, values["generator"])
+    choice = decode_dataclass(ChoiceConfig, values["choose"])
+    numbers = range(1, rounds + 1)
     found: dict[str, dict[str, Path | None]] = {
-        "picture": pictures,
+        "generator": {f"round_{number}": generator.named_file(number) for number in numbers},
+        "choice": {f"round_{number}": choice.named_file(number) for number in numbers},
         "model": {"weights": named_file(values["model"]["weights"])},
     }
     for rival, section in values["rivals"].items():

@@ -1,7 +1,8 @@
-"""Your own photos, one command: ``sceneexpander expand PHOTOS --inserted PICTURE --prompt "..."``.
+"""Your own photos, one command: ``sceneexpander expand PHOTOS --prompt "..." --inserted PICTURE``.
 
-``PHOTOS`` is a folder of photos, or a scene folder with a ``scene.yaml``. Runs unattended in ``runs/NAME`` and prints where the report is.
-Methods and settings are those of the project's params.yaml; ``key=value`` adds to them.
+``PHOTOS`` is a folder of photos, or a scene folder with a ``scene.yaml``. The picture beyond their boundary is your own (``--inserted``),
+or made from the words (``--generator``). Runs in ``runs/NAME`` and prints where the report is. Methods and settings are those of the
+project's params.yaml; ``key=value`` adds to them.
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from typing import Any
 
 import yaml
 
+from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point, printable
-from sceneexpander.generation import GeneratorConfig
+from sceneexpander.generation import Forecast, backend_of
 from sceneexpander.ingest import make_round, read_picture, safe_name, scene_files, survey_pictures
 from sceneexpander.plainfiles import require_folder, require_plain_file
 from sceneexpander.preflight import check_scene
@@ -36,6 +38,7 @@ from sceneexpander.report.cameras import camera_lines
 from sceneexpander.selection import Selection, check_name, read_selection
 from sceneexpander.workspace import make_workspace, merged_overrides, remove_tree, reproduce, run_lock
 
+_NO_PICTURE = "give one --inserted PICTURE for each round, or have them made: --generator reproject, openai, ..."
 SCENE_FILE = "scene.yaml"
 SOURCE_FILE = "source.json"  # in a run's folder: which photos it is of
 
@@ -51,6 +54,8 @@ class Request:
     objects: tuple[str, ...] = ()
     name: str | None = None
     overrides: tuple[str, ...] = ()
+    unattended: bool = False  # requests that cost something are sent without asking
+    dry_run: bool = False
 
 
 def make_parser() -> CommandParser:
@@ -70,6 +75,11 @@ def make_parser() -> CommandParser:
     parser.add_argument("--prompt", action="append", default=[], help="what to add, one per round")
     parser.add_argument("--motion", action="append", default=[], help="camera motion, e.g. 'turn right'")
     parser.add_argument("--object", action="append", default=[], help="new object, e.g. 'a wooden bench'")
+    parser.add_argument("--generator", help="what makes the picture where none is given: reproject, openai, ...")
+    parser.add_argument("--candidates", type=int, help="how many pictures it makes to choose from")
+    parser.add_argument("--choose", help="auto (default), the number of a candidate, or a picture of your own")
+    parser.add_argument("--yes", action="store_true", help="send requests that cost something without asking")
+    parser.add_argument("--dry-run", action="store_true", help="print what would be asked for, and stop")
     parser.add_argument("--name", help="name of the run (default: the folder's)")
     # No default: argparse would count settings, of which there may be none, among the arguments that are missing.
     parser.add_argument(
@@ -84,6 +94,12 @@ def parse_arguments(arguments: Sequence[str]) -> Request:
     for override in given.overrides:
         if "=" not in override:
             raise UserError("is not a setting", where=override, fix="write key=value, e.g. profile=smoke")
+    options = {
+        "generator": given.generator,
+        "generator.candidates": given.candidates,
+        "choose.candidate": given.choose,
+    }
+    settings = [f"{key}={value}" for key, value in options.items() if value is not None]
     return Request(
         photos=given.photos,
         inserted=tuple(given.inserted),
@@ -91,15 +107,19 @@ def parse_arguments(arguments: Sequence[str]) -> Request:
         motions=tuple(given.motion),
         objects=tuple(given.object),
         name=given.name,
-        overrides=tuple(given.overrides),
+        overrides=(*settings, *given.overrides),
+        unattended=given.yes,
+        dry_run=given.dry_run,
     )
 
 
-def stage_scene(request: Request, name: str, target: Path, *, max_megapixels: float = 200.0) -> None:
+def stage_scene(
+    request: Request, name: str, target: Path, *, max_megapixels: float = 200.0, recorded: bool = True
+) -> None:
     """Put the scene together as a folder with ``scene.yaml``: a copy of a scene folder, or made from photos and options.
 
     A copy holds what ``scene.yaml`` names and nothing else, as plain files that can be written. Pictures to insert may have
-    ``max_megapixels``; photos are read later, under the same limit.
+    ``max_megapixels``; photos are read later, under the same limit. ``recorded``: every round needs a picture of the user's.
 
     Raises:
         UserError: the folder, a picture or an option is unusable.
@@ -130,17 +150,18 @@ def stage_scene(request: Request, name: str, target: Path, *, max_megapixels: fl
         _copy(path, target / "captured" / path.name)
     rounds = []
     for k, spec in enumerate(specs):
-        if k >= len(request.inserted):
-            raise UserError(
-                f"round {k + 1} has no picture", where="--inserted", fix="give one --inserted PICTURE for each round"
-            )
-        source = request.inserted[k]
-        require_plain_file(source)
-        read_picture(source, max_megapixels=max_megapixels)
-        copy = _inserted_name(k + 1, source)
-        _copy(source, target / copy)
         words_of_round = {"prompt": spec.prompt, "motion": spec.motion, "object": spec.new_object}
-        rounds.append({**{key: text for key, text in words_of_round.items() if text}, "inserted": copy.as_posix()})
+        facts = {key: text for key, text in words_of_round.items() if text}
+        if k < len(request.inserted):
+            source = request.inserted[k]
+            require_plain_file(source)
+            read_picture(source, max_megapixels=max_megapixels)
+            copy = _inserted_name(k + 1, source)
+            _copy(source, target / copy)
+            facts["inserted"] = copy.as_posix()
+        elif recorded:
+            raise UserError(f"round {k + 1} has no picture", where="--inserted", fix=_NO_PICTURE)
+        rounds.append(facts)
     # The copy holds nothing but photos: what else was there is told by the notes alone.
     content = {"name": name, "rounds": rounds, **({"notes": list(survey.notes)} if survey.notes else {})}
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
@@ -219,8 +240,8 @@ def _scratch(folder: Path) -> Iterator[Path]:
         remove_tree(scratch)
 
 
-def expand(request: Request, *, project: Path) -> Path:
-    """Check the request, run the pipeline in ``runs/NAME`` and return the report page.
+def expand(request: Request, *, project: Path) -> Path | None:
+    """Check the request, run the pipeline in ``runs/NAME`` and return the report page; of a dry run None.
 
     Raises:
         UserError: the input is unusable (nothing has run then), somebody else works on this run, or a stage refused the input.
@@ -233,7 +254,8 @@ def expand(request: Request, *, project: Path) -> Path:
     base = read_selection(project)
     overrides = merged_overrides(base.overrides, request.overrides, project=project)
     config = parse_dataclass(ProjectConfig, compose(project / "conf", overrides))
-    if request.inserted and config.generator.backend != GeneratorConfig().backend:
+    recorded = backend_of(config.generator).takes_recorded
+    if request.inserted and not recorded:
         problem = f"is {config.generator.backend!r} and would take the place of --inserted"
         raise UserError(problem, where="generator.backend", fix="leave one of them out (here or in params.yaml)")
     # The lock comes first: nothing may change in a folder that another process works on.
@@ -242,15 +264,67 @@ def expand(request: Request, *, project: Path) -> Path:
         with _scratch(folder) as scratch:
             scene = scratch / name
             with _shown_as_given(scene, request):
-                stage_scene(request, name, scene, max_megapixels=config.scene.max_megapixels)
-                rounds = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
-            selection = Selection(scenes=(name,), rounds=rounds, methods=base.methods, overrides=overrides)
+                stage_scene(request, name, scene, max_megapixels=config.scene.max_megapixels, recorded=recorded)
+                checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
+            announce_forecasts(checked.forecasts, config.generator.backend, details=request.dry_run)
+            if request.dry_run:
+                return None
+            agree_to_requests(checked.forecasts, unattended=request.unattended)
+            selection = Selection(scenes=(name,), rounds=checked.rounds, methods=base.methods, overrides=overrides)
             folder.mkdir(exist_ok=True)
             source = json.dumps({"photos": os.fsdecode(_identity(request)), "name": name}, indent=1)
             write_bytes_atomic(folder / SOURCE_FILE, f"{source}\n".encode())
             make_workspace(folder, selection, project=project, scenes={name: scene}, move_scenes=True)
         reproduce(folder, project=project, lock=lock)
     return folder / "outputs" / "report" / "index.html"
+
+
+def announce_forecasts(forecasts: Sequence[Forecast], backend: str, *, details: bool) -> None:
+    """Print what a run would ask of a generator; without ``details`` only what a user must know."""
+    for number, forecast in enumerate(forecasts, start=1):
+        if details:
+            print(f"round {number}: generator {backend}")
+            print(f"  prompt: {printable(forecast.prompt)}")
+            print(f"  requests: {forecast.requests}, {_cost_words(forecast.cost_usd)}")
+        for note in (*forecast.notes, *forecast.warnings) if details else forecast.warnings:
+            print(f"  {printable(note)}" if details else f"round {number}: {printable(note)}")
+
+
+def _cost_words(cost_usd: float | None) -> str:
+    return "price not known (generator.price_usd)" if cost_usd is None else f"about {cost_usd:.2f} USD"
+
+
+def agree_to_requests(forecasts: Sequence[Forecast], *, unattended: bool) -> None:
+    """Ask before anything is sent that may cost something.
+
+    Raises:
+        UserError: the user does not want it, or there is nobody to ask.
+    """
+    costs = [forecast.cost_usd for forecast in forecasts if forecast.requests]
+    requests = sum(forecast.requests for forecast in forecasts)
+    if unattended or all(cost == 0 for cost in costs):
+        return
+    total = None if any(cost is None for cost in costs) else sum(cost or 0.0 for cost in costs)
+    what = f"{requests} request{'s' * (requests != 1)} to an image service, {_cost_words(total)}"
+    if not sys.stdin.isatty():
+        raise UserError(f"would send {what}", where="expand", fix="add --yes to send them without asking")
+    if input(f"{what}. Send? [y/N] ").strip().casefold() not in ("y", "yes"):
+        raise UserError("nothing was sent", where="expand", fix="--dry-run shows what would be")
+
+
+def choice_lines(folder: Path, name: str, rounds: int) -> list[str]:
+    """What became of the candidates of a finished run, where there were several, and how to take another."""
+    lines = []
+    for number in range(1, rounds + 1):
+        place = folder / "outputs" / name / f"round_{number}" / "inserted"
+        if not place.is_dir():
+            continue
+        inserted = InsertedView.load(place)
+        if len(inserted.provenance) > 1:
+            reason = f" ({inserted.ranking[0].reason})" if inserted.ranking else ""
+            lines.append(f"round {number}: candidate {inserted.chosen} of {len(inserted.provenance)} was taken{reason}")
+            lines.append(f"all of them: {place / 'sheet.png'}; the same command with --choose NUMBER takes another")
+    return lines
 
 
 @contextmanager
@@ -276,10 +350,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         with ended_by_signals():
             page = expand(request, project=find_project())
+            if page is None:
+                return
     except RuntimeError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
-    for line in camera_lines(page.parents[1]):
+    folder = page.parents[2]
+    selection = read_selection(folder)
+    chosen = choice_lines(folder, selection.scenes[0], selection.rounds)
+    for line in [*camera_lines(page.parents[1]), *chosen]:
         print(printable(line))
     print(f"report: {page}")
 

@@ -13,11 +13,20 @@ from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.image import WINDOW
 from sceneexpander.evaluation.truth import check_truth
-from sceneexpander.generation import generate_inserted_view
+from sceneexpander.generation import Forecast, GenerationContext, check_round
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
 from sceneexpander.models.weights import HUB_ID
+from sceneexpander.project import GENERATED_FOLDER, find_project
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckedScene:
+    """A scene that can run: how many rounds, and what obtaining their pictures would take."""
+
+    rounds: int
+    forecasts: tuple[Forecast, ...] = ()
 
 
 @dataclass(slots=True)
@@ -25,10 +34,17 @@ class Checked:
     """What this command has looked at already, so that scenes and jobs that share it do not wait for it again."""
 
     weights: set[ModelConfig] = field(default_factory=set)
-    pictures: dict[Hashable, int] = field(default_factory=dict)  # number of rounds
+    pictures: dict[Hashable, CheckedScene] = field(default_factory=dict)
 
 
-CHECKED_SECTIONS = ("seed", "scene", "generator", "model", "rivals")  # of the configuration, beside the device
+CHECKED_SECTIONS = (
+    "seed",
+    "scene",
+    "generator",
+    "choose",
+    "model",
+    "rivals",
+)  # of the configuration, beside the device
 
 
 def check_scene(
@@ -41,8 +57,8 @@ def check_scene(
     methods: Sequence[str] = (),
     device: bool = True,
     checked: Checked | None = None,
-) -> int:
-    """Compose the configuration for a scene and read all of its pictures; nothing is written.
+) -> CheckedScene:
+    """Compose the configuration for a scene and read all of its pictures; nothing is written, and no request is sent.
 
     Args:
         name: of the scene; selects its own option in ``conf/scene`` if there is one.
@@ -54,9 +70,6 @@ def check_scene(
         device: whether the device must be there; not on a machine that only hands jobs to others.
         checked: of the same command's earlier calls; weights are loaded and pictures decoded once.
 
-    Returns:
-        the number of rounds.
-
     Raises:
         UserError: one line about the first problem found.
     """
@@ -64,9 +77,9 @@ def check_scene(
     if device:
         check_device(config.device)
     checked = Checked() if checked is None else checked
-    pictures = folder, config.scene, config.generator, rounds
+    pictures = folder, config.scene, repr(config.generator), config.choose, rounds
     if pictures not in checked.pictures:
-        checked.pictures[pictures] = _check_pictures(folder, config, rounds)
+        checked.pictures[pictures] = _check_pictures(name, folder, config, rounds)
     needed = [config.model]
     for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
         section = config.rivals.of(rival)
@@ -86,8 +99,8 @@ def check_scene(
     return checked.pictures[pictures]
 
 
-def _check_pictures(folder: Path, config: ProjectConfig, rounds: int | None) -> int:
-    """Read the photos, the pictures to insert and what is known of the truth; the number of rounds."""
+def _check_pictures(name: str, folder: Path, config: ProjectConfig, rounds: int | None) -> CheckedScene:
+    """Read the photos, the pictures to insert that are there already, and what is known of the truth."""
     scene = load_scene(folder, config.scene)
     if min(scene.views.height, scene.views.width) < WINDOW:
         size = f"{scene.views.width} x {scene.views.height}"
@@ -97,12 +110,22 @@ def _check_pictures(folder: Path, config: ProjectConfig, rounds: int | None) -> 
             fix="raise it, or use photos that are less narrow",
         )
     count = len(scene.rounds) if rounds is None else rounds
-    records = [*scene.views.records]
+    records, forecasts = [*scene.views.records], []
     for number in range(1, count + 1):
-        inserted, _ = generate_inserted_view(scene, number, scene.views, folder, config.generator)
-        records += inserted.view.records
+        context = GenerationContext(
+            scene_folder=folder,
+            scene=name,
+            round_number=number,
+            spec=scene.round_spec(number),
+            captured=scene.views,
+            cache=find_project() / GENERATED_FOLDER,
+        )
+        forecast, inserted = check_round(context, config.generator, config.choose)
+        forecasts.append(forecast)
+        if inserted is not None:
+            records += inserted.view.records
     check_truth(folder, records)  # read by the last stages only, so a mistake in it would cost the whole run
-    return count
+    return CheckedScene(rounds=count, forecasts=tuple(forecasts))
 
 
 def check_device(device: str) -> None:

@@ -48,6 +48,7 @@ def decode_dataclass(
     """
     if not isinstance(raw, Mapping):
         raise DecodeError(f"is {describe(raw)}, expected a section with keys", where=_key(where))
+    schema = _member(schema, raw, where)
     hashable: Any = schema
     hints, required = fields_of(hashable)
     for key in raw:
@@ -69,6 +70,30 @@ def decode_dataclass(
         raise DecodeError(error.problem, where=_key(where, own), fix=error.fix) from None
     except REFUSALS as error:
         raise DecodeError(shorten(str(error), 300), where=_key(where)) from None
+
+
+def members_of(schema: type) -> tuple[type, ...]:
+    """The types that a section annotated as ``schema`` may have: of a family its members, else the type itself.
+
+    A family is a dataclass with a class method ``family() -> (key, members by the value of that key)``: its members have fields of their
+    own, and the key in a section says which of them it is.
+    """
+    family = getattr(schema, "family", None)
+    return (schema,) if family is None else tuple(family()[1].values())
+
+
+def _member(schema: type[T], raw: Mapping[Any, object], where: str) -> type[T]:
+    family = getattr(schema, "family", None)
+    if family is None:
+        return schema
+    key, members = family()
+    name = raw.get(key)
+    if key not in raw:
+        raise DecodeError("missing key", where=_key(where, key))
+    if not isinstance(name, str) or name not in members:
+        shown = repr(shorten(name)) if isinstance(name, str) else describe(name)
+        raise DecodeError(f"is {shown}", where=_key(where, key), fix=did_you_mean(str(name), members))
+    return members[name]
 
 
 @functools.cache

@@ -32,6 +32,7 @@ SECTIONS = (
     "frontend",
     "warmup",
     "generator",
+    "choose",
     "adapt",
     "refine",
     "optimise",
@@ -65,6 +66,7 @@ class Tiny:
             *((lock, "") for lock in LOCKS),
             (f"scenes/{SCENE}/photo.png", "photo"),
             ("away/picture.png", "picture"),
+            ("away/chosen.png", "chosen"),
             ("away/weights.safetensors", "weights"),
         ):
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
@@ -75,9 +77,10 @@ class Tiny:
         )
         self.write(layout.selection(SCENE), {name: True for name in layout.METHODS if name not in layout.OURS})
         self.write(layout.CODE, hashes(TREE, HERE))
-        for kind in ("picture", "model", *layout.RIVALS):
+        for kind in ("generator", "choice", "model", *layout.RIVALS):
             link_files({}, folder / layout.given(SCENE, kind))
-        link_files({"round_1": folder / "away/picture.png"}, folder / layout.given(SCENE, "picture"))
+        link_files({"round_1": folder / "away/picture.png"}, folder / layout.given(SCENE, "generator"))
+        link_files({"round_1": folder / "away/chosen.png"}, folder / layout.given(SCENE, "choice"))
         link_files({"weights": folder / "away/weights.safetensors"}, folder / layout.given(SCENE, "model"))
 
     def write(self, path: Path, content: dict[str, Any]) -> None:
@@ -126,10 +129,11 @@ FIRST_HAND_MODEL = {"resolve", "reconstruct", "precompute_anchors", "reconstruct
     ("file", "stages"),
     [
         ("away/picture.png", {"resolve", "generate_view"}),
+        ("away/chosen.png", {"resolve", "choose_view"}),
         ("away/weights.safetensors", FIRST_HAND_MODEL),
         ("requirements.lock", {"code"}),
         ("requirements-nodeps.lock", {"code"}),
-        (f"scenes/{SCENE}/photo.png", {"prepare", "generate_view", "evaluate"}),
+        (f"scenes/{SCENE}/photo.png", {"prepare", "generate_view", "choose_view", "evaluate"}),
     ],
 )
 def test_other_bytes_of_the_same_name_and_size_rerun_what_reads_them(tiny: Tiny, file: str, stages: set[str]) -> None:
@@ -153,13 +157,22 @@ def rerun_by(tiny: Tiny, code: dict[str, str]) -> set[str]:
 
 
 FITTING = {"precompute_anchors", "reconstruct_inserted", "correct", "adapt", "rival"}
-DRAWING = {"reconstruct", "gaussian_splatting", "optimise", "render", "pack", "evaluate"} | FITTING
+DRAWING = {
+    "reconstruct",
+    "generate_view",
+    "choose_view",
+    "gaussian_splatting",
+    "optimise",
+    "render",
+    "pack",
+    "evaluate",
+} | FITTING
 
 
 def test_another_build_of_the_rasteriser_reruns_what_draws(tiny: Tiny) -> None:
     changed = rerun_by(tiny, hashes(TREE, Environment(packages="p", kernel="v4")))
     assert changed >= DRAWING
-    assert not changed & {"prepare", "generate_view", "track"}
+    assert not changed & {"prepare", "track"}
 
 
 def test_other_packages_rerun_everything(tiny: Tiny) -> None:
@@ -169,7 +182,7 @@ def test_other_packages_rerun_everything(tiny: Tiny) -> None:
 @pytest.mark.parametrize(
     ("edited", "rerun", "kept"),
     [
-        ("splatting/kernel/rasteriser.cpp", DRAWING, {"prepare", "generate_view"}),
+        ("splatting/kernel/rasteriser.cpp", DRAWING, {"prepare"}),
         (
             "adaptation/loop.py",
             {"adapt", "correct"},
@@ -205,15 +218,18 @@ def test_a_configuration_names_its_files(tmp_path: Path, monkeypatch: pytest.Mon
         Path(name).touch()
     values = {
         "generator": {"backend": "file", "file": "p_{round}.png"},
+        "choose": {"candidate": "auto", "fit": "crop"},
         "model": {"weights": "w.safetensors"},
         "rivals": {"omnivggt": {"weights": None}, "ttt3r": {"weights": "org/name@main"}},
     }
     found = named_files(values, 3)
-    assert found["picture"] == {"round_1": tmp_path / "p_1.png", "round_2": tmp_path / "p_2.png"}
+    assert found["generator"] == {"round_1": tmp_path / "p_1.png", "round_2": tmp_path / "p_2.png"}
     assert found["model"] == {"weights": tmp_path / "w.safetensors"}
     assert found["omnivggt"] == found["ttt3r"] == {}
-    assert named_files(values | {"generator": {"backend": "replay", "file": None}}, 1)["picture"] == {}
-    link_files(found["picture"], Path("given"))
+    assert named_files(values | {"generator": {"backend": "replay"}}, 1)["generator"] == {}
+    own = named_files(values | {"choose": {"candidate": "p_{round}.png", "fit": "crop"}}, 3)["choice"]
+    assert own == found["generator"]
+    link_files(found["generator"], Path("given"))
     link_files(found["model"], Path("given"))
     assert [path.name for path in Path("given").iterdir()] == ["weights"]
 

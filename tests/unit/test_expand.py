@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -21,10 +22,14 @@ import yaml
 from PIL import Image
 
 from sceneexpander import expand as command
+from sceneexpander import preflight
 from sceneexpander.errors import UserError, printable
 from sceneexpander.expand import Request, expand, run_name, stage_scene
+from sceneexpander.generation import Forecast
+from sceneexpander.preflight import CheckedScene
 from sceneexpander.selection import read_selection
 from sceneexpander.workspace import run_lock
+from tests.unit.ingest.test_survey import texture
 
 ROOT = Path(__file__).parents[2]
 
@@ -57,7 +62,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (folder / part / "file").write_text("x")
     shutil.copytree(ROOT / "conf", folder / "conf")
     (folder / "params.yaml").write_text((ROOT / "params.yaml").read_text())
-    monkeypatch.setattr(command, "check_scene", lambda *_, **__: 1)
+    monkeypatch.setattr(command, "check_scene", lambda *_, **__: CheckedScene(rounds=1))
     monkeypatch.setattr(command, "reproduce", lambda *_, **__: None)
     return folder
 
@@ -304,7 +309,7 @@ def test_errors_name_the_users_files(project: Path, tmp_path: Path, monkeypatch:
     source = photos(tmp_path / "photos")
     for place, named in (("captured/1.png", source / "1.png"), ("inserted/round_1.png", tmp_path / "new.png")):
 
-        def refuse(_: str, folder: Path, *, place: str = place, **__: object) -> int:
+        def refuse(_: str, folder: Path, *, place: str = place, **__: object) -> CheckedScene:
             raise UserError("is bad", where=folder / place)
 
         monkeypatch.setattr(command, "check_scene", refuse)
@@ -341,7 +346,7 @@ def test_a_run_has_the_projects_methods_and_settings(
         "overrides: [seed=3, adapt.steps=7, rivals.omnivggt.weights=weights.safetensors]\n"
     )
     checked: list[dict[str, Any]] = []
-    monkeypatch.setattr(command, "check_scene", lambda *_, **given: checked.append(given) or 1)
+    monkeypatch.setattr(command, "check_scene", lambda *_, **given: checked.append(given) or CheckedScene(rounds=1))
     monkeypatch.chdir(tmp_path)  # relative paths of params.yaml are the project's
     expand(request(photos(tmp_path / "photos"), tmp_path, overrides=("adapt.steps=9",)), project=project)
     selection = read_selection(project / "runs" / "photos")
@@ -380,3 +385,90 @@ def test_what_is_missing_is_one_line_that_says_so(
     assert "--inserted bench.png" in line
     assert "key=value" not in line
     assert "PHOTOS" in line
+
+
+def reads_its_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check as it is."""
+    monkeypatch.setattr(command, "check_scene", preflight.check_scene)
+
+
+def place(folder: Path) -> Path:
+    """Photos with something to see in them."""
+    folder.mkdir()
+    for number in range(3):
+        texture(number).save(folder / f"{number}.png")
+    return folder
+
+
+REPROJECT = ("--generator", "reproject", "--motion", "move back 20 %")
+
+
+def test_a_round_needs_no_picture_where_one_is_made(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads_its_words(monkeypatch)
+    arguments = [str(place(tmp_path / "photos")), *REPROJECT, "profile=smoke"]
+    assert expand(command.parse_arguments(arguments), project=project) is not None
+    run = project / "runs" / "photos"
+    facts = yaml.safe_load((run / "scenes" / "photos" / "scene.yaml").read_text())["rounds"]
+    assert facts == [{"prompt": "move back 20 %", "motion": "move back 20 %"}]
+    assert "generator=reproject" in read_selection(run).overrides
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--motion", "move back"], "--inserted: round 1 has no picture; give one --inserted PICTURE"),
+        (["--generator", "reprojct", "--motion", "move back"], "did you mean 'reproject'?"),
+        (["--generator", "reproject", "--prompt", "A bench."], "says no camera motion"),
+        (["--generator", "reproject", "--motion", "fly to the moon"], "'fly to the moon' is not understood"),
+        ([*REPROJECT, "--inserted", "x.png"], "would take the place of --inserted"),
+        ([*REPROJECT, "--candidates", "4"], "generator.candidates: "),
+        ([*REPROJECT, "--candidates", "many"], "invalid int value"),
+        ([*REPROJECT, "--choose", "none.png"], "none.png: does not exist"),
+    ],
+)
+def test_generators_refuse_in_one_line(
+    arguments: list[str], said: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads_its_words(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError) as caught:
+        expand(command.parse_arguments([str(place(tmp_path / "photos")), *arguments, "profile=smoke"]), project=project)
+    assert said in caught.value.line()
+    assert not (project / "runs").exists()
+
+
+def test_a_dry_run_says_what_would_be_asked_for_and_leaves_nothing(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reads_its_words(monkeypatch)
+    arguments = [str(place(tmp_path / "photos")), *REPROJECT, "--object", "a bench", "--dry-run", "profile=smoke"]
+    assert expand(command.parse_arguments(arguments), project=project) is None
+    printed = capsys.readouterr().out
+    assert "round 1: generator reproject" in printed
+    assert "following the requirements: move back 20 %, a bench." in printed
+    assert "requests: 0" in printed
+    assert "invents no object: 'a bench'" in printed
+    assert not (project / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("answer", "unattended", "fine"), [("y", False, True), ("", False, False), (None, False, False), (None, True, True)]
+)
+def test_what_costs_something_is_asked_for_first(
+    answer: str | None, unattended: bool, fine: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: answer is not None, raising=False)
+    asked: list[str] = []
+    monkeypatch.setattr("builtins.input", lambda text: asked.append(text) or answer)
+    forecasts = [Forecast(prompt="x", requests=2, cost_usd=0.5), Forecast(prompt="y", requests=1, cost_usd=0.25)]
+    if fine:
+        command.agree_to_requests(forecasts, unattended=unattended)
+    else:
+        with pytest.raises(UserError):
+            command.agree_to_requests(forecasts, unattended=unattended)
+    assert bool(asked) == (answer is not None)
+    assert all("3 requests to an image service, about 0.75 USD" in text for text in asked)
+    command.agree_to_requests([Forecast(prompt="free")], unattended=False)

@@ -23,7 +23,7 @@ ROOMS: dict[str, set[str]] = {
     "splatting": {"geometry"},
     "models": {"geometry", "frontend", "splatting", "synthetic"},  # the last two: training of the embedded model
     "ingest": {"artifacts", "geometry"},
-    "generation": {"artifacts", "geometry", "ingest", "splatting"},
+    "generation": {"artifacts", "frontend", "geometry", "ingest", "splatting"},
     "adaptation": {"artifacts", "geometry", "models", "splatting"},
     "optimisation": {"artifacts", "evaluation", "geometry", "splatting"},
     "inference": {"artifacts", "geometry", "models"},

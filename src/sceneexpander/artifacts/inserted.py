@@ -13,25 +13,76 @@ SCHEMA = "inserted/1"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:
-    """How one picture was made. Never holds a secret: keys are read from the environment at call time only."""
+    """How one picture was made. Never holds a secret: keys are read from the environment at call time only.
 
-    backend: str  # "replay", "file", ...
-    prompt: str  # the full text, after the template was filled
-    source: str  # file name, or model snapshot
-    sha256: str  # of the picture's original bytes
-    reference_sha256: tuple[str, ...] = ()  # of the captured pictures that were shown to the generator
+    Attributes:
+        backend: name of the back-end.
+        prompt: the text that was sent, or that belongs to a picture which was there before.
+        source: file name, or model.
+        sha256: of the picture's original bytes.
+        reference_sha256: of the views that were shown to the generator: their originals' bytes.
+        parameters: what was asked for, and what was noticed about the answer.
+        refusal: why it cannot be used; None: it can.
+        request_id: what the service calls the request; None: it gives no name, or there was none.
+        created: when the answer came, UTC (ISO 8601); None: not known.
+        usage: what the service counted, e.g. tokens.
+        cost_usd: estimated from the configured price; None: no price is configured, or nothing was asked of a service.
+        digital_source_type: IPTC's term for how the picture came to be, e.g. "trainedAlgorithmicMedia"; None: not known.
+    """
+
+    backend: str
+    prompt: str
+    source: str
+    sha256: str
+    reference_sha256: tuple[str, ...] = ()
     parameters: dict[str, str] = field(default_factory=dict)
-    refusal: str | None = None  # why it cannot be used
+    refusal: str | None = None
+    request_id: str | None = None
+    created: str | None = None
+    usage: dict[str, int] = field(default_factory=dict)
+    cost_usd: float | None = None
+    digital_source_type: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CandidateScore:
+    """How well one candidate goes with the scene so far. Shares are in [0, 1].
+
+    Attributes:
+        candidate: its number.
+        total: what candidates are ranked by, larger is better: the weighted mean of the others.
+        registration: how surely its camera is known: matched points of the scene that agree with one pose.
+        inliers: how many these are.
+        reprojection_px: median distance of theirs from where that pose puts them, in stored pixels; None without a pose.
+        appearance: likeness to the scene rendered from that pose, where the scene has been seen; None without a pose.
+        sharpness: detail, relative to the captured views.
+        novelty: share of the picture that shows what the scene so far does not; None without a pose.
+        reason: the same in words.
+    """
+
+    candidate: int
+    total: float
+    registration: float
+    inliers: int
+    reprojection_px: float | None
+    appearance: float | None
+    sharpness: float
+    novelty: float | None
+    reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InsertedView:
-    """The chosen candidate fitted to the captured views' size; all candidates' provenance in order."""
+    """The chosen candidate fitted to the captured views' size; all candidates' provenance in order.
+
+    ``ranking`` says how they compare and why the chosen one was taken; empty where there was nothing to choose.
+    """
 
     round: int
     view: ViewSet  # exactly one view, generated=True
     chosen: int
     provenance: tuple[Provenance, ...]
+    ranking: tuple[CandidateScore, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.view) != 1:
@@ -42,7 +93,12 @@ class InsertedView:
     def save(self, folder: Path) -> None:
         """Write into a (scratch) folder."""
         self.view.save(folder / "view")
-        facts = {"round": self.round, "chosen": self.chosen, "provenance": self.provenance}
+        facts = {
+            "round": self.round,
+            "chosen": self.chosen,
+            "provenance": self.provenance,
+            "ranking": self.ranking,
+        }
         save_artifact(folder, SCHEMA, facts, {})
 
     @classmethod
@@ -52,7 +108,11 @@ class InsertedView:
         read = read_typed(_Facts, facts, folder / FACTS_NAME)
         with refusing(folder):
             return cls(
-                round=read.round, view=ViewSet.load(folder / "view"), chosen=read.chosen, provenance=read.provenance
+                round=read.round,
+                view=ViewSet.load(folder / "view"),
+                chosen=read.chosen,
+                provenance=read.provenance,
+                ranking=read.ranking,
             )
 
 
@@ -63,3 +123,4 @@ class _Facts:
     round: int
     chosen: int
     provenance: tuple[Provenance, ...]
+    ranking: tuple[CandidateScore, ...] = ()

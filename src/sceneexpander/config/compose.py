@@ -14,12 +14,13 @@ from sceneexpander.config.overrides import MAX_OVERRIDE, environment_hidden
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import did_you_mean
-from sceneexpander.typed import shorten
+from sceneexpander.typed import fields_of, members_of, shorten
 
 FORBIDDEN_KEYS = frozenset({"size", "nfiles"})  # the pipeline's cache key leaves these names out, silently
 DEFAULT_SCENE = "default"
 MAX_KEY = 200  # characters
 _ROOT = "config"
+_RENAMED = {"generator.candidate": "choose.candidate", "generator.fit": "choose.fit"}
 
 
 def scene_option(conf: Path, scene: str) -> str:
@@ -158,13 +159,30 @@ def explain(error: Exception, conf: Path, overrides: Sequence[str]) -> ConfigErr
     """Hydra's message as one line that names the override at fault and the nearest thing that exists."""
     known = known_keys(ProjectConfig)
     first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-    for override in overrides:
-        key = override.lstrip("+~").partition("=")[0]
+    # The longest key first: ``generator`` is in every message about ``generator.file`` as well.
+    for key in sorted((override.lstrip("+~").partition("=")[0] for override in overrides), key=len, reverse=True):
         if key and key in str(error):
+            if key in _RENAMED:
+                return ConfigError("has another name now", where=key, fix=f"write {_RENAMED[key]}")
             if key not in known:
                 return ConfigError("unknown key", where=key, fix=_nearest_key(conf, key, known))
+            if owners := _owners(key):
+                fix = f"it belongs to {' and '.join(owners)}"
+                return ConfigError("is no setting of what was chosen", where=key, fix=fix)
             return ConfigError(f"cannot be set ({shorten(first.strip(), 200)})", where=key)
     return ConfigError(shorten(first.strip(), 200), where=conf)
+
+
+def _owners(key: str) -> list[str]:
+    """The members of a section's family that have a setting, as overrides (``generator=file``); none for other sections."""
+    import typing
+
+    section, _, name = key.partition(".")
+    hint = typing.get_type_hints(ProjectConfig).get(section)
+    family = getattr(hint, "family", None)
+    if family is None:
+        return []
+    return [f"{section}={member}" for member, schema in family()[1].items() if name in fields_of(schema)[0]]
 
 
 def _nearest_key(conf: Path, key: str, known: Sequence[str]) -> str:
@@ -184,5 +202,6 @@ def known_keys(schema: type, prefix: str = "") -> list[str]:
         path = f"{prefix}{name}"
         keys.append(path)
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            keys.extend(known_keys(hint, f"{path}."))
+            below = [key for member in members_of(hint) for key in known_keys(member, f"{path}.")]
+            keys.extend(dict.fromkeys(below))
     return keys

@@ -18,10 +18,20 @@ from pathlib import Path
 
 from sceneexpander.config.parse import ConfigError
 from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.typed import members_of
 
-PATH_KEYS = frozenset({"model.weights", "generator.file", "rivals.omnivggt.weights", "rivals.ttt3r.weights"})
+PATH_KEYS = frozenset(
+    {
+        "model.weights",
+        "generator.file",
+        "generator.workflow",
+        "choose.candidate",
+        "rivals.omnivggt.weights",
+        "rivals.ttt3r.weights",
+    }
+)
 MAX_OVERRIDE = 20_000  # characters: key frames are the longest
-ROUND_FIELD = "{round}"  # in ``generator.file``: the number of the round
+ROUND_FIELD = "{round}"  # in a picture's path: the number of the round
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_./@-]*")  # the same in every grammar, and easier to read without quotes
 _WORDS = frozenset({"null", "true", "false", "inf", "nan"})
 _SECRETS = "oc.env"  # OmegaConf's way to the environment
@@ -57,8 +67,11 @@ def text_keys() -> frozenset[str]:
 def _text_keys(schema: type, prefix: str) -> Iterator[str]:
     for name, hint in typing.get_type_hints(schema).items():
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            yield from _text_keys(hint, f"{prefix}{name}.")
-        elif {hint, *typing.get_args(hint)} - {types.NoneType} == {str} or hint == str | None:
+            for member in members_of(hint):
+                yield from _text_keys(member, f"{prefix}{name}.")
+        elif hint is str or (
+            typing.get_origin(hint) in (typing.Union, types.UnionType) and str in typing.get_args(hint)
+        ):
             yield f"{prefix}{name}"
 
 

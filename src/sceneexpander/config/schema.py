@@ -11,7 +11,7 @@ from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.generation import GeneratorConfig
+from sceneexpander.generation import ChoiceConfig, GeneratorConfig
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
 from sceneexpander.optimisation.config import OptimiseConfig, RefineConfig
@@ -33,6 +33,7 @@ class ProjectConfig:
     threads: Annotated[int, Range(0, 256)]
     scene: IngestConfig
     generator: GeneratorConfig
+    choose: ChoiceConfig
     model: ModelConfig
     frontend: FrontendConfig
     warmup: WarmupConfig

@@ -1,20 +1,27 @@
 """From a sentence to the picture beyond the captured boundary."""
 
-from sceneexpander.generation.backends import BACKENDS, make_generator
-from sceneexpander.generation.config import GeneratorConfig
-from sceneexpander.generation.insert import generate_inserted_view
-from sceneexpander.generation.prompt import EXPLORATION, PromptTemplate, fill_prompt
-from sceneexpander.generation.protocol import Candidate, GenerationContext, ViewGenerator
+from sceneexpander.generation.backends import BACKENDS, backend_of, make_generator
+from sceneexpander.generation.choose import ChosenView, check_round, choose_view
+from sceneexpander.generation.config import ChoiceConfig, GeneratorConfig
+from sceneexpander.generation.prompt import EXPLORATION, PromptTemplate, fill_prompt, split_words
+from sceneexpander.generation.protocol import Backend, Forecast, GenerationContext, SceneSoFar, ViewGenerator
 
 __all__ = [
     "BACKENDS",
     "EXPLORATION",
-    "Candidate",
+    "Backend",
+    "ChoiceConfig",
+    "ChosenView",
+    "Forecast",
     "GenerationContext",
     "GeneratorConfig",
     "PromptTemplate",
+    "SceneSoFar",
     "ViewGenerator",
+    "backend_of",
+    "check_round",
+    "choose_view",
     "fill_prompt",
-    "generate_inserted_view",
     "make_generator",
+    "split_words",
 ]

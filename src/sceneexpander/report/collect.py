@@ -16,6 +16,7 @@ from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import Scene
+from sceneexpander.artifacts.source_type import source_type_xmp
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_bytes_atomic, write_json_atomic
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet, to_uint8
@@ -161,7 +162,9 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
     inserted = InsertedView.load(source.inserted)
     chosen = inserted.provenance[inserted.chosen]
     base = f"round_{source.number}"
-    _save_picture(folder / base / "inserted.jpg", inserted.view.detail_images[0])
+    kind = chosen.digital_source_type
+    xmp = None if kind is None else source_type_xmp(kind, credit=f"{chosen.backend}: {Path(chosen.source).name}")
+    _save_picture(folder / base / "inserted.jpg", inserted.view.detail_images[0], xmp)
     sheet = source.inserted / "sheet.png"
     if sheet.is_file():
         shutil.copyfile(sheet, folder / base / "sheet.png")
@@ -180,6 +183,8 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
         "full_prompt": chosen.prompt,
         "backend": chosen.backend,
         "origin": Path(chosen.source).name,
+        "source_type": kind,
+        "ranking": inserted.ranking,
         "parameters": chosen.parameters,
         "candidates": len(inserted.provenance),
         "inserted": f"{base}/inserted.jpg",
@@ -325,8 +330,8 @@ def _copy(source: Path, folder: Path, place: str) -> str:
     return place
 
 
-def _save_picture(path: Path, image: Tensor) -> None:
+def _save_picture(path: Path, image: Tensor, xmp: bytes | None = None) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = Image.fromarray(to_uint8(image))
     picture.thumbnail((_PICTURE_SIDE_PX, _PICTURE_SIDE_PX))
-    picture.save(path, format="JPEG", quality=88)
+    picture.save(path, format="JPEG", quality=88, **({} if xmp is None else {"xmp": xmp}))

@@ -15,7 +15,7 @@ from sceneexpander.report.cameras import FACTS, cameras_shown
 from sceneexpander.report.collect import MAIN_METHOD
 from sceneexpander.report.course import FITTED, fits, looks_shown, verdict, was_fitted
 from sceneexpander.report.curve import curve_chart, objective_curves, smoothing_window
-from sceneexpander.report.words import LAYERS, TABLES, method_words
+from sceneexpander.report.words import LAYERS, PICTURE_KINDS, TABLES, method_words
 
 _ARROWS = {"higher": "\u2191", "lower": "\u2193", "": ""}
 
@@ -74,6 +74,8 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
             key: facts[key]
             for key in ("number", "prompt", "full_prompt", "backend", "origin", "candidates", "inserted", "viewer")
         },
+        "made": PICTURE_KINDS.get(facts["source_type"], "Picture"),
+        "reasons": [f"candidate {score['candidate']}: {score['reason']}" for score in facts["ranking"]],
         "sheet": facts["sheet"] if facts["candidates"] > 1 else None,
         "warnings": facts["warnings"],
         "methods": methods,

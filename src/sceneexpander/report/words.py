@@ -6,7 +6,13 @@ from dataclasses import dataclass
 
 from sceneexpander.artifacts.metrics import Fit
 from sceneexpander.artifacts.quantities import GEOMETRY, INSERTION, QUALITY, Quantity
+from sceneexpander.artifacts.source_type import MADE_BY_MODEL, MADE_FROM_SCENE
 
+# How an inserted picture came to be, as far as that is known.
+PICTURE_KINDS = {
+    MADE_BY_MODEL: "AI-generated picture",
+    MADE_FROM_SCENE: "Picture rendered from the scene itself, with parts that nobody captured",
+}
 LAYERS = (("rgb", "Colour"), ("depth", "Depth"), ("provenance", "Provenance"))
 
 

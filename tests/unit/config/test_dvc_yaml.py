@@ -65,12 +65,13 @@ def filled(path: str) -> str:
             [
                 layout.config("S"),
                 layout.selection("S"),
-                *(layout.given("S", kind) for kind in ("picture", "model", *layout.RIVALS)),
+                *(layout.given("S", kind) for kind in ("generator", "choice", "model", *layout.RIVALS)),
             ],
         ),
         ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
         ("reconstruct", [layout.state("S", 0), layout.statistics("reconstruct", "S")]),
-        ("generate_view", [layout.inserted("S", 2), layout.statistics("generate_view", "S", 2)]),
+        ("generate_view", [layout.candidates("S", 2), layout.statistics("generate_view", "S", 2)]),
+        ("choose_view", [layout.inserted("S", 2), layout.statistics("choose_view", "S", 2)]),
         (
             "precompute_anchors",
             [
@@ -134,7 +135,7 @@ def test_nothing_persists_but_what_belongs_to_this_machine() -> None:
         for path, options in item.items()
         if options.get("persist")
     }
-    given = {layout.given("S", kind).as_posix() for kind in ("picture", "model", *layout.RIVALS)}
+    given = {layout.given("S", kind).as_posix() for kind in ("generator", "choice", "model", *layout.RIVALS)}
     # Never restored from the cache of runs (another machine's environment), never copied into it (links to the user's files).
     assert persistent == {"mlflow/tracked.json", layout.CODE.as_posix(), layout.ENVIRONMENT.as_posix()} | given
 

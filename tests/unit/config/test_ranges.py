@@ -19,7 +19,9 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
+from sceneexpander.generation import GeneratorConfig
 from sceneexpander.ranges import Range, check_ranges, number_ranges
+from sceneexpander.typed import members_of
 
 CONF = Path(__file__).parents[3] / "conf"
 KEYS = "render.keyframes=[{eye: [0, 0, 0], target: [0, 0, 1]}]"
@@ -67,7 +69,7 @@ def changed(way: Steps, value: float) -> tuple[dict[str, Any], str]:
     last: str | int = way[-1]
     if isinstance(holder[last], list):
         holder, last, way = holder[last], 0, (*way, 0)
-    assert isinstance(holder[last], (int, float)), way
+    assert isinstance(holder[last], (int, float)) or holder[last] == "auto", way
     holder[last] = value
     key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in way)
     return values, key.removeprefix(".")
@@ -105,6 +107,14 @@ def test_a_number_has_a_range_and_nothing_just_outside_passes(way: Steps, hint: 
         with pytest.raises(ConfigError) as caught:
             parse_dataclass(ProjectConfig, values)
         assert caught.value.line() == f"{key}: is {value}, must be {declared}"
+
+
+@pytest.mark.parametrize("member", members_of(GeneratorConfig), ids=lambda member: member.__name__)
+def test_numbers_of_every_back_end_have_ranges(member: type) -> None:
+    for way, _, declared in numbers(member):
+        assert declared is not None, way
+        assert math.isfinite(declared.low)
+        assert math.isfinite(declared.high)
 
 
 @pytest.mark.parametrize("value", [1e30, -1e30, 10**5000, -(10**5000)], ids=["1e30", "-1e30", "1e5000", "-1e5000"])

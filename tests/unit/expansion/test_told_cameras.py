@@ -27,7 +27,8 @@ from sceneexpander.expansion import (
 )
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig
-from sceneexpander.generation import GeneratorConfig, generate_inserted_view
+from sceneexpander.generation import ChoiceConfig, GenerationContext, check_round
+from sceneexpander.generation.backends.stored import ReplayConfig
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.ingest import IngestConfig, load_scene
 from sceneexpander.reconstruction import views
@@ -65,7 +66,16 @@ def told_model() -> LoadedModel:
 
 def read(folder: Path) -> tuple[Scene, InsertedView]:
     scene = load_scene(folder, IngestConfig(long_side_px=224, detail_scale=2))
-    inserted, _ = generate_inserted_view(scene, 1, scene.views, folder, GeneratorConfig())
+    context = GenerationContext(
+        scene_folder=folder,
+        scene="s",
+        round_number=1,
+        spec=scene.round_spec(1),
+        captured=scene.views,
+        cache=folder / "cache",
+    )
+    _, inserted = check_round(context, ReplayConfig(), ChoiceConfig())
+    assert inserted is not None
     return scene, inserted
 
 

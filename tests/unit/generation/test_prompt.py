@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from sceneexpander.artifacts.scene import RoundSpec
-from sceneexpander.generation.prompt import EXPLORATION, PromptTemplate, fill_prompt
+from sceneexpander.errors import UserError
+from sceneexpander.generation.prompt import EXPLORATION, PromptTemplate, fill_prompt, split_words
 from sceneexpander.ingest import make_round
 
 HEAD = "You are exploring. Please generate a new viewpoint following the requirements: "
@@ -47,7 +48,37 @@ def test_what_the_user_wrote_is_never_a_field(words: str) -> None:
 
 
 def test_no_words() -> None:
-    with pytest.raises(ValueError, match="without words"):
+    with pytest.raises(UserError, match="has no words"):
         fill_prompt(RoundSpec(prompt=" . "))
     with pytest.raises(ValueError, match="exactly once"):
         PromptTemplate(text="Draw [NEW_OBJECT].")
+
+
+@pytest.mark.parametrize(
+    ("sentence", "motion", "content"),
+    [
+        ("Turn right 30 degrees, there is a well.", "Turn right 30 degrees", "there is a well"),
+        ("Move back to reveal a bench.", "Move back", "a bench"),
+        ("Move back 20 % and then turn left. A cat sleeps.", "Move back 20 % and then turn left", "A cat sleeps"),
+        ("Turn right towards the old gate, a well, and a cat", "Turn right towards the old gate", "a well, and a cat"),
+        ("move up 1.5 m; a roof", "move up 1.5 m", "a roof"),
+        ("Move back 20 %", "Move back 20 %", ""),
+        ("Behind the white table is a wooden bench.", "", "Behind the white table is a wooden bench"),
+        ("To the right of the table, there is a door.", "", "To the right of the table, there is a door"),
+        ("Look at the table, it has a cat on it", "", "Look at the table, it has a cat on it"),
+        ("A cat. Turn right.", "", "A cat. Turn right"),
+    ],
+)
+def test_a_free_sentence_is_split_where_its_motion_ends(sentence: str, motion: str, content: str) -> None:
+    assert split_words(RoundSpec(prompt=sentence)) == (motion, content)
+    filled = ", ".join(part for part in (motion, content) if part)
+    assert fill_prompt(RoundSpec(prompt=sentence)) == f"{HEAD}{filled}."
+
+
+def test_fields_that_are_given_are_not_split() -> None:
+    spec = RoundSpec(prompt="Turn right, a well.", motion="go on", new_object="move back, a cat")
+    assert split_words(spec) == ("go on", "move back, a cat")
+    assert split_words(RoundSpec(prompt="Turn left, a well.", new_object="Turn right, a cat")) == (
+        "",
+        "Turn right, a cat",
+    )

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,17 +16,13 @@ from PIL import Image
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.errors import UserError
-from sceneexpander.generation import GeneratorConfig, generate_inserted_view
+from sceneexpander.generation import ChoiceConfig, ChosenView, GeneratorConfig, check_round, choose_view, make_generator
+from sceneexpander.generation.backends.stored import FileConfig, ReplayConfig
 from sceneexpander.ingest import IngestConfig, load_scene
+from tests.unit.generation.rounds import context_of, flat_scene, photo
 
 CONFIG = IngestConfig(long_side_px=84)
-
-
-def photo(path: Path, seed: int, size: tuple[int, int] = (168, 252), **options: object) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    coarse = np.random.default_rng(seed).integers(0, 255, (5, 7, 3), dtype=np.uint8)
-    Image.fromarray(coarse).resize(size[::-1], Image.Resampling.BICUBIC).save(path, **options)
-    return path
+REPLAY = ReplayConfig()
 
 
 @pytest.fixture
@@ -43,17 +40,30 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def insert(folder: Path, number: int, **settings: object) -> InsertedView:
-    scene = load_scene(folder, CONFIG)
-    config = GeneratorConfig(**settings)  # type: ignore[arg-type]
-    view, sheet = generate_inserted_view(scene, number, scene.views, folder, config)
-    assert sheet.ndim == 3
+def chosen_view(
+    folder: Path, number: int, generator: GeneratorConfig = REPLAY, scene: Scene | None = None, **choice: Any
+) -> ChosenView:
+    """Through both stages: candidates, then the choice; and what is known before agrees with it."""
+    scene = load_scene(folder, CONFIG) if scene is None else scene
+    context, so_far, chosen = context_of(scene, folder, number), flat_scene(scene.views), ChoiceConfig(**choice)
+    _, foreseen = check_round(context, generator, chosen)
+    made = make_generator(generator).generate(context, so_far)
+    view = choose_view(context, made.candidates, so_far, chosen, seed=0)
+    assert view.sheet.ndim == 3
+    if not view.inserted.ranking:
+        assert foreseen is not None
+        assert foreseen.provenance == view.inserted.provenance
+        assert torch.equal(foreseen.view.images, view.inserted.view.images)
     return view
 
 
-def refusal(folder: Path, number: int, **settings: object) -> str:
+def insert(folder: Path, number: int, generator: GeneratorConfig = REPLAY, **choice: Any) -> InsertedView:
+    return chosen_view(folder, number, generator, **choice).inserted
+
+
+def refusal(folder: Path, number: int, generator: GeneratorConfig = REPLAY, **choice: Any) -> str:
     with pytest.raises(UserError) as caught:
-        insert(folder, number, **settings)
+        insert(folder, number, generator, **choice)
     return caught.value.line()
 
 
@@ -84,7 +94,7 @@ def test_recorded_picture(folder: Path, tmp_path: Path) -> None:
 
 
 def test_folder_of_candidates(folder: Path) -> None:
-    first, second = insert(folder, 2), insert(folder, 2, candidate=1)
+    first, second = insert(folder, 2, candidate=0), insert(folder, 2, candidate=1)
     assert first.view.records[0].name == "2.png"
     assert second.view.records[0].name == "10.png"
     assert [p.source for p in first.provenance] == ["candidates/2.png", "candidates/10.png"]
@@ -104,62 +114,62 @@ def test_letterbox_keeps_everything(folder: Path) -> None:
     inserted = insert(folder, 2, candidate=1, fit="pad")
     assert inserted.provenance[1].parameters["kept"] == "1.0000"
     assert inserted.view.images[0, :, :, :10].std() < 1e-5  # flat grey, up to float rounding
-    assert insert(folder, 2, candidate=1).view.images[0, :, :, :10].std() > 0.01
+    assert insert(folder, 2, candidate=1, fit="crop").view.images[0, :, :, :10].std() > 0.01
 
 
 def test_own_file(folder: Path, tmp_path: Path) -> None:
     photo(tmp_path / "mine_3.webp", 20)
-    inserted = insert(folder, 3, backend="file", file=str(tmp_path / "mine_{round}.webp"))
+    inserted = insert(folder, 3, FileConfig(file=str(tmp_path / "mine_{round}.webp")))
     assert inserted.provenance[0].backend == "file"
     assert inserted.provenance[0].source == "mine_3.webp"  # no path of the user's machine is recorded
-    assert "generator.file: is not set" in refusal(folder, 3, backend="file")
-    assert "none.png: does not exist" in refusal(folder, 3, backend="file", file=str(tmp_path / "none.png"))
-    assert "is a folder" in refusal(folder, 3, backend="file", file=str(tmp_path))
+    assert "generator.file: is not set" in refusal(folder, 3, FileConfig())
+    assert "none.png: does not exist" in refusal(folder, 3, FileConfig(file=str(tmp_path / "none.png")))
+    assert "is a folder" in refusal(folder, 3, FileConfig(file=str(tmp_path)))
 
 
 def test_copy_of_a_captured_view_is_noticed(folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with Image.open(folder / "captured" / "v1.jpg") as picture:
         picture.resize((200, 133)).save(tmp_path / "copy.jpg", quality=60)
     with caplog.at_level(logging.WARNING):
-        inserted = insert(folder, 3, backend="file", file=str(tmp_path / "copy.jpg"))
+        inserted = insert(folder, 3, FileConfig(file=str(tmp_path / "copy.jpg")))
     assert "nearly a copy of v1.jpg" in inserted.provenance[0].parameters["warning"]
     assert "nearly a copy of v1.jpg" in caplog.text
 
 
 def test_much_cropped_picture_is_noticed(folder: Path, tmp_path: Path) -> None:
-    inserted = insert(folder, 3, backend="file", file=str(photo(tmp_path / "tall.png", 30, size=(300, 100))))
+    inserted = insert(folder, 3, FileConfig(file=str(photo(tmp_path / "tall.png", 30, size=(300, 100)))))
     assert "fits the captured aspect ratio" in inserted.provenance[0].parameters["warning"]
 
 
 def test_content_that_cannot_be_a_view(folder: Path, tmp_path: Path) -> None:
     def line(pixels: np.ndarray) -> str:
         Image.fromarray(pixels).save(tmp_path / "x.png")
-        return refusal(folder, 3, backend="file", file=str(tmp_path / "x.png"))
+        return refusal(folder, 3, FileConfig(file=str(tmp_path / "x.png")))
 
     assert "x.png: shows a single colour" in line(np.full((200, 300, 3), (9, 200, 30), np.uint8))
     assert "x.png: has only 20 x 30 pixels" in line(np.random.default_rng(0).integers(0, 255, (30, 20, 3), np.uint8))
     (tmp_path / "x.png").write_bytes(b"<html>error 500</html>")
-    assert "x.png: is not a picture" in refusal(folder, 3, backend="file", file=str(tmp_path / "x.png"))
+    assert "x.png: is not a picture" in refusal(folder, 3, FileConfig(file=str(tmp_path / "x.png")))
 
 
 def test_refusals(folder: Path, tmp_path: Path) -> None:
-    assert "unknown back-end 'replai'; did you mean 'replay'?" in refusal(folder, 1, backend="replai")
+    assert "unknown back-end 'replai'; did you mean 'replay'?" in refusal(folder, 1, GeneratorConfig(backend="replai"))
     assert "round 3" in refusal(folder, 3)
     assert "has no recorded picture" in refusal(folder, 3)
     assert "round 4 was asked for" in refusal(folder, 4)
     for settings in ({"candidate": -1}, {"fit": "squash"}):
-        with pytest.raises(UserError, match=rf"^(generator\.)?{next(iter(settings))}: "):
-            GeneratorConfig(**settings)  # type: ignore[arg-type]
+        with pytest.raises(UserError, match=rf"^(choose\.)?{next(iter(settings))}: "):
+            ChoiceConfig(**settings)  # type: ignore[arg-type]
 
 
 def test_a_recorded_picture_that_changed_is_refused(folder: Path) -> None:
     scene = load_scene(folder, CONFIG)
     photo(folder / "one.png", 99)
     with pytest.raises(UserError, match="changed since the scene was prepared"):
-        generate_inserted_view(scene, 1, scene.views, folder, GeneratorConfig())
+        chosen_view(folder, 1, scene=scene)
     photo(folder / "candidates" / "2.png", 98)
     with pytest.raises(UserError, match="changed since the scene was prepared"):
-        generate_inserted_view(scene, 2, scene.views, folder, GeneratorConfig())
+        chosen_view(folder, 2, scene=scene)
 
 
 def test_recorded_path_may_not_leave_the_scene(folder: Path, tmp_path: Path) -> None:
@@ -168,14 +178,11 @@ def test_recorded_path_may_not_leave_the_scene(folder: Path, tmp_path: Path) -> 
     rounds = (dataclasses.replace(scene.rounds[0], inserted="../outside.png", inserted_sha256=None),)
     bent = Scene(name="x", views=scene.views, rounds=rounds)
     with pytest.raises(UserError, match="leads out of"):
-        generate_inserted_view(bent, 1, bent.views, folder, GeneratorConfig())
+        chosen_view(folder, 1, scene=bent)
 
 
 def test_contact_sheet_shows_all_and_marks_the_choice(folder: Path) -> None:
-    scene = load_scene(folder, CONFIG)
-    sheets = [
-        generate_inserted_view(scene, 2, scene.views, folder, GeneratorConfig(candidate=index))[1] for index in (0, 1)
-    ]
+    sheets = [chosen_view(folder, 2, candidate=index).sheet for index in (0, 1)]
     assert sheets[0].shape == sheets[1].shape
     changed = (sheets[0] - sheets[1]).abs().amax(0) > 0.1
     rows, columns = changed.nonzero(as_tuple=True)
@@ -183,3 +190,20 @@ def test_contact_sheet_shows_all_and_marks_the_choice(folder: Path) -> None:
     # Only the borders in the second row, of the first two tiles, differ.
     assert int(rows.min()) >= sheets[0].shape[1] // 2
     assert int(columns.max()) < sheets[0].shape[2] // 2
+
+
+def test_a_picture_of_ones_own_takes_the_place_of_all_candidates(folder: Path, tmp_path: Path) -> None:
+    own = photo(tmp_path / "mine_2.png", 50)
+    inserted = insert(folder, 2, candidate=str(tmp_path / "mine_{round}.png"))
+    assert inserted.chosen == 2
+    assert inserted.provenance[2].sha256 == hashlib.sha256(own.read_bytes()).hexdigest()
+    assert inserted.view.records[0].name == "mine_2.png"
+    assert "none.png: does not exist" in refusal(folder, 2, candidate=str(tmp_path / "none.png"))
+
+
+def test_auto_passes_over_what_is_no_picture(folder: Path) -> None:
+    (folder / "candidates" / "2.png").write_bytes(b"no picture")
+    inserted = insert(folder, 2)
+    assert inserted.chosen == 1
+    assert inserted.provenance[0].refusal is not None
+    assert inserted.ranking == ()

@@ -1,0 +1,42 @@
+"""choose_view: which of a round's candidates is inserted, fitted to the captured views' size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sceneexpander.artifacts.candidates import CandidateSet
+from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.artifacts.views import save_png
+from sceneexpander.config.files import read_sections
+from sceneexpander.generation import ChoiceConfig, choose_view
+from stages import layout
+from stages.machine import use_machine
+from stages.rounds import generation_context, scene_so_far
+from stages.runner import Cell, stage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sections:
+    """What this stage reads of the configuration."""
+
+    seed: int
+    threads: int
+    choose: ChoiceConfig
+
+
+@stage("scene", "round", "previous")
+def main(cell: Cell) -> None:
+    """Check, rank, choose; the contact sheet shows all candidates."""
+    sections = read_sections(layout.config(cell.scene), Sections)
+    use_machine(sections.threads)
+    made = CandidateSet.load(layout.candidates(cell.scene, cell.round))
+    chosen = choose_view(
+        generation_context(cell), made.candidates, scene_so_far(cell), sections.choose, seed=sections.seed
+    )
+    with directory_being_written(layout.inserted(cell.scene, cell.round)) as folder:
+        chosen.inserted.save(folder)
+        save_png(folder / "sheet.png", chosen.sheet)
+
+
+if __name__ == "__main__":
+    main()
