@@ -292,3 +292,16 @@ def test_the_captured_ratio_is_asked_for(
     height: int, width: int, changes: dict[str, Any], expected: str, service: Service
 ) -> None:
     assert asked_size(height, width, settings(service, **changes)) == expected
+
+
+@pytest.mark.parametrize("key", ["hunter2", KEY])
+def test_a_key_that_the_service_repeats_is_not_shown(
+    key: str, service: Service, so_far: SceneSoFar, context: GenerationContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it looks like; and what looks like a key is left out even if it is not ours."""
+    monkeypatch.setenv("TEST_KEY", key)
+    service.answers = [error(401, f"Incorrect API key provided: {key}, use sk-anotherone012345.")]
+    with pytest.raises(UserError) as caught:
+        generator(service).generate(context, so_far)
+    assert key not in caught.value.line()
+    assert "anotherone" not in caught.value.line()

@@ -17,6 +17,7 @@ from sceneexpander.adaptation.observe import Look
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.metrics import Fit, MetricsRow, SizeMetrics, UnavailableRow
 from sceneexpander.artifacts.scene import RoundSpec, Scene
+from sceneexpander.artifacts.source_type import read_source_type
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
@@ -424,6 +425,30 @@ def test_facts_hold_no_absolute_path(gathered: Path) -> None:
     text = (gathered / "page.json").read_text()
     assert str(gathered.parent) not in text
     assert read_json(gathered / "page.json")["rounds"][0]["backend"] == "replay"
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("trainedAlgorithmicMedia", "AI-generated picture: new.png"),
+        ("compositeSynthetic", "Picture rendered from the scene itself, with parts that nobody captured: new.png"),
+        (None, "Picture: new.png"),
+    ],
+)
+def test_the_page_and_the_picture_say_how_it_came_to_be(
+    kind: str | None, words: str, source: SceneSource, tmp_path: Path
+) -> None:
+    place = source.rounds[0].inserted
+    inserted = InsertedView.load(place)
+    (provenance,) = inserted.provenance
+    replace(inserted, provenance=(replace(provenance, digital_source_type=kind),)).save(tmp_path / "inserted")
+    collect_scene(
+        replace(source, rounds=[replace(source.rounds[0], inserted=tmp_path / "inserted")]), tmp_path / "pages" / "room"
+    )
+    with Image.open(tmp_path / "pages" / "room" / "round_1" / "inserted.jpg") as picture:
+        assert read_source_type(picture.info.get("xmp", b"").decode()) == kind
+    write_page([tmp_path / "pages" / "room"], tmp_path / "report")
+    assert words in (tmp_path / "report" / "index.html").read_text()
 
 
 @pytest.mark.parametrize(
