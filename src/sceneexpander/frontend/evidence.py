@@ -216,7 +216,7 @@ def _rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], 
     return largest_rival_angle_deg(
         fit,
         best,
-        others,
+        others[0],
         mapping.intrinsics[view],
         threshold_px=mapping.config.epipolar_px * mapping.unit_px,
         still_fits=_STILL_FITS,

@@ -17,40 +17,36 @@ from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, OtherView
 from sceneexpander.frontend.twoview import usac_parameters
 
 _FLAT_SHARE = 0.6  # of the matches with another view lie on one plane
-_MIN_MATCHES = 30
-_MOST_OTHERS = 2  # those with most matches; the others' matches take part in the refinement all the same
 _MOST_BEHIND = 0.2  # share of the matches that meet behind a camera
 
 
 def largest_rival_angle_deg(
     fit: EpipolarFit,
     best: EpipolarView,
-    others: Sequence[OtherView],
+    other: OtherView,
     intrinsics: Float[np.ndarray, "3 3"],
     *,
     threshold_px: float,
     still_fits: float,
     seed: int,
 ) -> float:
-    """How far (degrees) the directions to the other views, their median, move to the farthest pose that fits about as well; 0 without one.
+    """How far (degrees) the direction to the other view moves to the farthest pose that fits about as well; 0 without one.
 
     Args:
-        fit: of the view's matches with ``others``.
+        fit: of the view's matches with ``other``.
         best: pose and lens of the view, refined over ``fit``.
-        others: cameras that are believed.
+        other: a camera that is believed.
         intrinsics: of the view.
         threshold_px: error of a match that lies on a plane.
         still_fits: times what ``best`` leaves unexplained: a pose that leaves less than this fits as well.
-        seed: of the robust fits.
+        seed: of the robust fit.
     """
     worst = 0.0
-    for start in _poses_of_planes(best, others, intrinsics, threshold_px=threshold_px, seed=seed):
+    for start in _poses_of_plane(best, other, intrinsics, threshold_px=threshold_px, seed=seed):
         rival = fit.refine(start.rotation, start.translation, best.lens, held_lens())
-        if (
-            rival.cost < still_fits * best.cost
-            and fit.behind(rival.rotation, rival.translation, rival.lens).mean() < _MOST_BEHIND
-        ):
-            worst = max(worst, float(np.median(direction_changes_deg(best, rival, others))))
+        behind = fit.behind(rival.rotation, rival.translation, rival.lens).mean()
+        if rival.cost < still_fits * best.cost and behind < _MOST_BEHIND:
+            worst = max(worst, float(direction_changes_deg(best, rival, [other])[0]))
     return worst
 
 
@@ -66,30 +62,22 @@ def direction_changes_deg(
     return np.array(angles)
 
 
-def _poses_of_planes(
-    best: EpipolarView,
-    others: Sequence[OtherView],
-    intrinsics: Float[np.ndarray, "3 3"],
-    *,
-    threshold_px: float,
-    seed: int,
+def _poses_of_plane(
+    best: EpipolarView, other: OtherView, intrinsics: Float[np.ndarray, "3 3"], *, threshold_px: float, seed: int
 ) -> Iterator[EpipolarView]:
-    """Poses that the plane most matches with another view lie on leaves open, as far from that view as the pose found is."""
-    for other in sorted(others, key=lambda other: -len(other.own_xy))[:_MOST_OTHERS]:
-        if len(other.own_xy) < _MIN_MATCHES:
-            continue
-        matrix, mask = cv2.findHomography(other.own_xy, other.view_xy, usac_parameters(threshold_px, seed))
-        if matrix is None or mask.mean() < _FLAT_SHARE:
-            continue
-        plane = np.linalg.inv(intrinsics) @ matrix @ other.intrinsics
-        count, rotations, translations, _ = cv2.decomposeHomographyMat(plane, np.eye(3))
-        apart = float(np.linalg.norm(best.rotation.T @ best.translation - other.rotation.T @ other.translation))
-        for turn, step in zip(rotations[:count], translations[:count], strict=True):
-            length = float(np.linalg.norm(step))
-            if length > 0:
-                yield EpipolarView(
-                    rotation=turn @ other.rotation,
-                    translation=turn @ other.translation + step.ravel() * (apart / length),
-                    lens=best.lens,
-                    cost=1.0,
-                )
+    """Poses that the plane most matches lie on leaves open, as far from the other view as the pose found is; none without such a plane."""
+    matrix, mask = cv2.findHomography(other.own_xy, other.view_xy, usac_parameters(threshold_px, seed))
+    if matrix is None or mask.mean() < _FLAT_SHARE:
+        return
+    plane = np.linalg.inv(intrinsics) @ matrix @ other.intrinsics
+    count, rotations, translations, _ = cv2.decomposeHomographyMat(plane, np.eye(3))
+    apart = float(np.linalg.norm(best.rotation.T @ best.translation - other.rotation.T @ other.translation))
+    for turn, step in zip(rotations[:count], translations[:count], strict=True):
+        length = float(np.linalg.norm(step))
+        if length > 0:
+            yield EpipolarView(
+                rotation=turn @ other.rotation,
+                translation=turn @ other.translation + step.ravel() * (apart / length),
+                lens=best.lens,
+                cost=1.0,
+            )

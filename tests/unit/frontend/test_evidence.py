@@ -90,6 +90,17 @@ def test_two_photos_of_something_flat_allow_another_place(relief: float, open_to
     assert ("flat" in replace(found, direction_sigma_deg=0.0).doubt(CONFIG)) == open_to_another, found
 
 
+@pytest.mark.parametrize(("relief", "settled"), [(True, True), (False, False)])
+def test_how_a_photo_of_another_size_was_cut_out_needs_depth_to_be_known(relief: bool, settled: bool) -> None:
+    """Before a wall a centre somewhere else is another direction; view 4 of the model may be a part of a photo."""
+    world = worlds.point_world(57, points=250)
+    mapping, features, pairs = model_of(noisy(world if relief else flat(world)))
+    mapping.registered[1:4] = False
+    found = weigh_evidence(mapping, features, pairs, [False] * 5)
+    assert (found[4].spread_deg < CONFIG.max_spread_deg) == settled, found[4]
+    assert found[0].spread_deg == 0, "it has the size of the main lens"
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
