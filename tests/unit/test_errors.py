@@ -91,6 +91,8 @@ def test_an_interrupt_while_libraries_are_imported_is_one_line_too(tmp_path: Pat
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # Python turns SIGINT into KeyboardInterrupt only where it is not ignored, and background jobs inherit that it is.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "importing\n"

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ CHILD = (
 WAITS = f"{CHILD}time.sleep(60)"
 PARENT = """
 import sys
+from collections.abc import Callable
 from pathlib import Path
 sys.path.insert(0, {src!r})
 from sceneexpander.errors import entry_point
@@ -51,10 +53,21 @@ def wait_for(what, seconds: float = 15.0) -> bool:  # type: ignore[no-untyped-de
     return bool(what())
 
 
-def started(folder: Path, child: str = WAITS, **more: object) -> subprocess.Popen[str]:
+def hear_signals() -> None:
+    """Undo what a shell's background job or `nohup` hands down: ignored signals are inherited."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
+def started(folder: Path, child: str = WAITS, before: Callable[[], object] = hear_signals) -> subprocess.Popen[str]:
     script = PARENT.format(src=str(ROOT / "src"), child=child)
     process = subprocess.Popen(
-        [sys.executable, "-c", script], cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **more
+        [sys.executable, "-c", script],
+        cwd=folder,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=before,
     )
     assert wait_for(lambda: (folder / "pids").is_file() and len((folder / "pids").read_text().split()) == 2)
     return process
@@ -112,7 +125,7 @@ def test_the_end_of_the_block_is_the_end_of_the_command(tmp_path: Path) -> None:
 
 
 def test_nohup_keeps_it_running(tmp_path: Path) -> None:
-    process = started(tmp_path, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
+    process = started(tmp_path, before=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
     process.send_signal(signal.SIGHUP)
     time.sleep(0.5)
     assert process.poll() is None
@@ -124,6 +137,7 @@ def test_output_and_environment_pass_through(tmp_path: Path) -> None:
     child = "import os; print(os.environ['GIVEN'])"
     code = f"""
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from sceneexpander.processes import run_group
 run_group([sys.executable, "-c", {child!r}], cwd=Path.cwd(), env={{"GIVEN": "hello"}})

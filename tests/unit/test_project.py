@@ -20,6 +20,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 # Names of modules where they are not the distribution's.
 MODULES = {
     "opencv-python-headless": "cv2",
+    "google-genai": "google",
     "pillow": "PIL",
     "pyyaml": "yaml",
     "hydra-core": "hydra",

@@ -30,7 +30,9 @@ SCHEMA = "ablation/2"
 DEFAULT, CORRECTED = "none", "corrected"
 READING = "<!-- Above: written by the command. Below: written by hand, without numbers. -->"
 _SHORT = tuple(
-    c for c in COLUMNS if c.name in {"psnr_db", "others_psnr_db", "inserted_psnr_db", "new_psnr_db", "between_psnr_db"}
+    c
+    for c in COLUMNS
+    if c.name in {"own_psnr_db", "others_psnr_db", "inserted_psnr_db", "new_psnr_db", "between_psnr_db"}
 )
 _COLUMN = {column.name: column for column in COLUMNS}
 
@@ -120,6 +122,7 @@ Written by `make ablation`, which measures every number below on expandbench: pr
 (168 x 224, photographs of twice that for the features), one view inserted beyond the end of the captured walk, true cameras and depths of
 both. The picture is drawn with a known misalignment (`expandbench/grades.py`); the geometric front-end runs as it does for photos, and
 nothing of the truth reaches a method. Finished cells are kept in `.cache/expandbench`: the command continues where it was stopped.
+Prepared scenes stay there for the four codes and configurations used last.
 
 ```
 make ablation                                              # all studies below; the better part of a day on two cores
@@ -224,7 +227,7 @@ def _in_short(results: Results) -> list[str]:
         ):
             texts = [
                 text
-                for name in ("psnr_db", "others_psnr_db", "depth_abs_rel", "new_psnr_db", "between_psnr_db")
+                for name in ("own_psnr_db", "others_psnr_db", "depth_abs_rel", "new_psnr_db", "between_psnr_db")
                 if (text := _said(cells, row, against, _COLUMN[name])) is not None
                 and not (against == CAPTURED and name in _NEW)
             ]

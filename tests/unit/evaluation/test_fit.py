@@ -8,7 +8,8 @@ import pytest
 
 from sceneexpander.artifacts.metrics import Fit, MetricsRow
 from sceneexpander.artifacts.store import write_json_atomic
-from sceneexpander.evaluation import EvaluateConfig, evaluate
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.selection import METHODS, OPTIMISABLE, OURS, RIVALS
 from stages import layout
 from stages.evaluate import fit_of

@@ -21,9 +21,10 @@ from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.prepared import PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, Settings
 from sceneexpander.expandbench.scenes import BenchScene
-from sceneexpander.expansion import adapt_round, correct_round, refined, refined_round, rounds
+from sceneexpander.expansion import adapt_round, correct_round, refined, refined_round
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.reconstruction import fitting
 
 ROOT = Path(__file__).parents[3]
 GRADE = "mixed_2"
@@ -114,7 +115,7 @@ def test_fixed_rows_are_fitted_with_the_seed_of_their_pair_and_doubt_nothing(
 
 def test_every_row_of_a_pair_is_fitted_as_long_per_view(worker: bench._Worker, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: dict[int, set[float]] = {}
-    whole = rounds.refine
+    whole = fitting.refine
 
     def counted(start: Reconstruction, images: Any, settings: RefineConfig, **more: Any) -> Any:
         result, report = whole(start, images, settings, **more)
@@ -122,7 +123,7 @@ def test_every_row_of_a_pair_is_fitted_as_long_per_view(worker: bench._Worker, m
         steps.setdefault(len(start.view_ids), set()).add(report.steps / int(start.posed.sum()))
         return result, report
 
-    monkeypatch.setattr(rounds, "refine", counted)
+    monkeypatch.setattr(fitting, "refine", counted)
     for row in (CAPTURED, BASELINE, "corrected"):
         kept(worker, monkeypatch, "" if row == CAPTURED else GRADE, row, 0)
     assert steps == {5: {1.0}, 6: {1.0}}
