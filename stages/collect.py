@@ -6,6 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+from sceneexpander.artifacts.page import flatten
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_yaml, write_yaml
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene
@@ -53,19 +54,20 @@ def _gaussians(scene: str, selected: dict[str, Any]) -> dict[str, str]:
 def main(cell: Cell) -> None:
     """List artefacts by what params.yaml selects: files of rounds or methods that were taken out may still lie there."""
     selected: dict[str, Any] = read_yaml(Path("params.yaml"))
+    config = read_yaml(layout.config(cell.scene))
     source = SceneSource(
         scene=layout.prepared(cell.scene),
         report=layout.state(cell.scene, 0) / "report.json",
         statistics=layout.OUTPUTS / cell.scene / "stats",
         rounds=[_round(cell.scene, item["k"], selected["methods"]) for item in selected["rounds"]],
-        config=read_yaml(layout.config(cell.scene)),
+        settings=flatten(config),
         overrides=read_overrides(Path("params.yaml")),
         cameras=layout.cameras(layout.state(cell.scene, 0)),
     )
     with directory_being_written(layout.PAGES / cell.scene) as folder:
         collect_scene(source, folder)
         # For the recording, which depends on the gathered folders alone.
-        write_yaml(folder / layout.PAGE_CONFIG, source.config)
+        write_yaml(folder / layout.PAGE_CONFIG, config)
         write_json_atomic(folder / layout.PAGE_GAUSSIANS, _gaussians(cell.scene, selected))
 
 

@@ -43,8 +43,9 @@ def main(_: Cell) -> None:
         raise UserError("selects nothing to report", where="params.yaml", fix="name scenes, rounds and methods")
     with directory_being_written(layout.REPORT) as folder:
         write_page([layout.PAGES / scene for scene in selected["scenes"]], folder)
-        write_bytes_atomic(folder / "comparison.md", comparison_table(rows).markdown().encode())
-        write_bytes_atomic(folder / "scenes.csv", scene_table(rows).csv().encode())
+        for name, table in (("comparison", comparison_table(rows)), ("scenes", scene_table(rows))):
+            for ending, text in (("md", table.markdown()), ("csv", table.csv()), ("tex", table.latex())):
+                write_bytes_atomic(folder / f"{name}.{ending}", text.encode())
     write_json_atomic(RESULTS, numbers)
 
 

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from sceneexpander.artifacts.live import LOG_NAME, read_live
-from sceneexpander.artifacts.quantities import tracked_look, tracked_step
+from sceneexpander.artifacts.page import flatten
+from sceneexpander.catalogue import MAIN
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.describe import describe_experiment
-from sceneexpander.tracking.record import flatten
 from sceneexpander.tracking.store import COMPLETE_TAG, LIVE_TAG, open_store, store_lock
+from sceneexpander.tracking.tracked import tracked_look, tracked_step
 
 _log = logging.getLogger(__name__)
 
@@ -95,7 +96,7 @@ class Follower:
                     return None
                 client.delete_run(run.info.run_id)
             describe_experiment(client, experiment)
-            name = f"{facts['scene']} r{facts['round']} sceneexpander, running"
+            name = f"{facts['scene']} r{facts['round']} {MAIN}, running"
             tags = {LIVE_TAG: identity, "scene": facts["scene"], "round": str(facts["round"]), "mlflow.runName": name}
             started_ms = int(1000 * facts["started"])
             run = client.create_run(experiment, start_time=started_ms, tags=tags, run_name=name)
@@ -119,5 +120,5 @@ class Follower:
 def _numbers(line: Mapping[str, Any]) -> dict[str, float]:
     """Curves of a line, named as in a whole run."""
     if line["kind"] == "step":
-        return tracked_step(line)
-    return tracked_look(line) if line["kind"] == "look" else {}
+        return tracked_step(line, inserted=bool(line["inserted"]))
+    return tracked_look(line, line["drift"]) if line["kind"] == "look" else {}

@@ -21,7 +21,7 @@ from sceneexpander.adaptation.checkpoint import Checkpoint as AdaptationCheckpoi
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
-from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics, UnavailableRow, ViewMetrics, load_row
+from sceneexpander.artifacts.metrics import MetricsRow, UnavailableRow, ViewMetrics, load_row
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
@@ -79,13 +79,10 @@ def scene() -> Scene:
 
 
 def metrics() -> MetricsRow:
-    view = ViewMetrics(
-        view_id="v", generated=False, posed=True, psnr_db=20.0, ssim=0.9, coverage=1.0, generated_share=0.0
-    )
+    view = ViewMetrics(view_id="v", generated=False, posed=True, values={"psnr_captured_db": 20.0})
     return MetricsRow(
-        scene="room", round=1, method="backbone", model="mini", weights_sha256="a", seed=0, captured_views=2, generated_views=1,
-        gaussians=9, generated_gaussians=3, psnr_db=20.0, ssim=0.9, coverage=1.0, truth=TruthMetrics(camera_ate=0.1),
-        spread={"psnr_db": 0.1}, views=(view,), versions={"torch": "2"},
+        scene="room", round=1, method="backbone", model="mini", weights_sha256="a", seed=0,
+        values={"psnr_captured_db": 20.0, "camera_ate": 0.1}, spread={"psnr_captured_db": 0.1}, views=(view,), versions={"torch": "2"},
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from sceneexpander.tracking.store import LIVE_TAG, NAMES
 from tests.unit.tracking.test_store import CONFIG, client, record, runs
 
 FACTS = {"scene": "room", "round": 1, "steps": 3, "sections": {"adapt": {"steps": 3}}}
-OBJECTIVE, LOOKED = "4_loss/objective_with_inserted", "5_look/psnr_captured_db"
+OBJECTIVE, LOOKED = "4_loss/loss_with_inserted", "5_look/captured_psnr"
 LOOK = {"step": 0, "captured_psnr": 20.0, "inserted_psnr": 15.5, "drift": {"network.trunk": 0.25}}
 
 
