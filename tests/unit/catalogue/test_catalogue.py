@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 
@@ -27,6 +28,7 @@ from sceneexpander.catalogue import (
     register,
 )
 from sceneexpander.catalogue.course import COURSE, DRIFT_ALL
+from sceneexpander.catalogue.document import metrics_document
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.evaluate import MEASURES
 from sceneexpander.tracking.tracked import tracked_step
@@ -110,3 +112,8 @@ def test_methods_start_from_methods() -> None:
         if method.starts_from is not None:
             assert method_named(method.starts_from).kind is not Kind.OPTIMISED
     assert len({method.title for method in METHODS}) == len(names)
+
+
+def test_the_page_about_the_metrics_is_what_the_catalogue_says() -> None:
+    page = Path(__file__).parents[3] / "docs" / "metrics.md"
+    assert page.read_text(encoding="utf-8") == metrics_document(), "run: python -m sceneexpander.catalogue.document"
