@@ -6,14 +6,14 @@ Places of files are relative to the folder. Pictures and videos lie beside the f
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from sceneexpander.artifacts.cameras import CameraReport
 from sceneexpander.artifacts.inserted import CandidateScore
-from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed, write_json_atomic
+from sceneexpander.artifacts.store import ArtifactError, check_inside, read_json, read_typed, write_json_atomic
 
 SCHEMA = "page/1"
 NAME = "page.json"
@@ -287,12 +287,28 @@ class ScenePage:
 
     @classmethod
     def load(cls, folder: Path) -> ScenePage:
-        """Read what `save` wrote. Raises `ArtifactError` for another schema or a damaged file."""
+        """Read what `save` wrote. Raises `ArtifactError` for another schema, a damaged file, or one that leads out of the folder."""
         path = folder / NAME
         content = read_json(path)
         if not isinstance(content, dict) or content.pop("schema", None) != SCHEMA:
             raise ArtifactError(f"is not of schema {SCHEMA!r}", where=path, fix=_FIX)
-        return read_typed(cls, content, path, fix=_FIX)
+        page = read_typed(cls, content, path, fix=_FIX)
+        for place in page.places():
+            check_inside(place, folder)
+        return page
+
+    def places(self) -> Iterator[str]:
+        """Every file that it names."""
+        yield from (photo.picture for photo in self.captured)
+        for item in self.rounds:
+            yield from (item.inserted, item.viewer)
+            yield from (place for place in (item.sheet, item.problems) if place is not None)
+            yield from (missing.metrics for missing in item.unavailable)
+            yield from (place for look in (item.looks.looks if item.looks else ()) for place in look.pictures.values())
+            for method in item.methods:
+                yield method.metrics
+                yield from (*method.videos.values(), *method.view_pictures.values())
+                yield from (place for still in method.stills for place in still.pictures.values())
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

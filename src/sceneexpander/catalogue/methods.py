@@ -24,7 +24,7 @@ class Method:
     """One row. In texts, ``{model}`` stands for the reconstructor's own name.
 
     Attributes:
-        name: in params.yaml, in folders, in tables of numbers and in MLflow.
+        name: where methods are selected, in folders, in tables of numbers and in MLflow.
         kind: what sort of method.
         stage: which stage of the pipeline makes it.
         starts_from: the method whose result it needs, if any.

@@ -215,7 +215,7 @@ def test_only_the_view_of_this_round_counts_as_inserted() -> None:
 def test_non_finite_numbers_are_refused() -> None:
     scene = made_reconstruction()
     row = evaluate(scene, own_pictures(scene), CONFIG, scene="m", round_number=1, seed=0)
-    with pytest.raises(ValueError, match="psnr_captured_db of backbone is inf"):
+    with pytest.raises(ValueError, match="psnr_captured_db of sceneexpander is inf"):
         dataclasses.replace(row, values={**row.values, "psnr_captured_db": float("inf")})
 
 
