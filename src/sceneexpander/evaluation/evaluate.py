@@ -20,7 +20,7 @@ from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverag
 
 
 class Counts(Measure):
-    """How many views and Gaussians there are."""
+    """How many Gaussians there are."""
 
     metrics = metrics_named("gaussians", "gaussians_generated")
 
@@ -50,8 +50,11 @@ def register_measure(measure: Measure) -> None:
     """Have a measure from outside the package taken in every evaluation, and its metrics shown wherever metrics are.
 
     Raises:
-        ValueError: a metric's name is that of another one.
+        ValueError: a metric's name is that of another one, or another measure answers with it.
     """
+    for other in MEASURES:
+        if both := {metric.name for metric in measure.metrics} & {metric.name for metric in other.metrics}:
+            raise ValueError(f"{type(other).__name__} answers with {min(both)!r} already")
     register(*measure.metrics)
     MEASURES.append(measure)
 

@@ -112,6 +112,12 @@ def test_a_measure_answers_only_with_what_it_declares() -> None:
         evaluated()
 
 
+def test_a_metric_is_measured_once() -> None:
+    register_measure(Toy())
+    with pytest.raises(ValueError, match="Toy answers with 'brightness_captured' already"):
+        register_measure(Toy())
+
+
 def test_numbers_of_captured_and_of_inserted_views_are_not_mixed_up() -> None:
     class Mixed(Toy):
         def of_view(self, view: SeenView) -> Values:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from sceneexpander.artifacts.live import LOG_NAME, LiveLog, read_live
+from sceneexpander.artifacts.live import LOG_NAME, LiveLog, LiveRun, LiveStep, read_live
 from sceneexpander.tracking import record_runs
 from sceneexpander.tracking.follow import STALE_S, Follower
 from sceneexpander.tracking.store import LIVE_TAG, NAMES
@@ -39,7 +39,7 @@ def test_a_log_is_readable_at_any_moment(tmp_path: Path) -> None:
     log.write("step", _step(1))
     with (tmp_path / LOG_NAME).open("a") as file:
         file.write('{"kind": "step", "st')  # as a killed run leaves it
-    assert [line["kind"] for line in read_live(tmp_path)] == ["run", "step"]
+    assert [type(line) for line in read_live(tmp_path)] == [LiveRun, LiveStep]
 
 
 def test_a_running_adaptation_shows_and_is_finished(root: Path) -> None:
