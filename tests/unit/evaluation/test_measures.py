@@ -44,7 +44,7 @@ DENSITY = Metric(
 class Toy(Measure):
     """One number of every photo, one of the whole."""
 
-    metrics = (BRIGHTNESS, DENSITY)
+    metrics: tuple[Metric, ...] = (BRIGHTNESS, DENSITY)
 
     def of_view(self, view: SeenView) -> Values:
         return {} if view.generated else {BRIGHTNESS.name: float(view.render.rgb.mean())}
