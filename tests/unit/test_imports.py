@@ -61,7 +61,8 @@ ROOMS: dict[str, set[str]] = {
         "splatting",
         "synthetic",
     },
-    "rendering": {"artifacts", "evaluation", "geometry", "splatting"},
+    "exports": {"artifacts", "geometry", "splatting", "viewer"},  # the last: which Gaussians are seen most
+    "rendering": {"artifacts", "evaluation", "exports", "geometry", "splatting"},
     "tracking": {"artifacts", "evaluation"},
     "viewer": {"artifacts", "geometry", "splatting"},
     "report": {"artifacts", "evaluation", "viewer"},
