@@ -48,6 +48,7 @@ COLOURS = ("red", "green", "blue")
 COMPRESSED = {"packed_position", "packed_rotation", "packed_scale", "packed_color"}
 RENDER_MODES = {True: "mip", False: "default"}
 MAX_COUNT_DIGITS = 15
+MOST_VIEWS = 1 << 31
 MAX_COMMENT = 1000  # letters of one line; the header as a whole is bounded by `MAX_HEADER_BYTES`
 FEWEST_TO_JUDGE = 10  # of fewer Gaussians nobody can say what their numbers mean
 WIDE_OVERLAP = 3.0  # size of the usual Gaussian in distances between neighbours, beyond which a scene would be fog
@@ -307,8 +308,10 @@ def _gaussians(table: NDArray[np.void], header: _Header, path: Path, linear: fro
 
     higher = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(len(table), 3, rest // 3).transpose(1, 2)
     unknown = np.full(len(table), -1, np.int64)
-    if "source_view" in names and not np.isfinite(table["source_view"]).all():
-        raise UserError("has a source_view that is no number", where=path)
+    if (
+        "source_view" in names and not (np.abs(table["source_view"].astype(np.float64)) < MOST_VIEWS).all()
+    ):  # NaN neither
+        raise UserError("has a source_view that is no number of a view", where=path)
     source_view = table["source_view"].astype(np.int64) if "source_view" in names else unknown
     means, opacities, scales = (
         columns("x", "y", "z"),
