@@ -63,7 +63,8 @@ ROOMS: dict[str, set[str]] = {
         "splatting",
         "synthetic",
     },
-    "rendering": {"artifacts", "evaluation", "geometry", "splatting"},
+    "exports": {"artifacts", "geometry", "splatting", "viewer"},  # the last: which Gaussians are seen most
+    "rendering": {"artifacts", "evaluation", "exports", "geometry", "splatting"},
     "tracking": {"artifacts", "catalogue", "evaluation"},
     "viewer": {"artifacts", "catalogue", "geometry", "splatting"},
     "report": {"artifacts", "catalogue", "evaluation", "viewer"},
