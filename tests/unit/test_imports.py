@@ -23,7 +23,8 @@ ROOMS: dict[str, set[str]] = {
     "splatting": {"geometry"},
     "models": {"geometry", "frontend", "splatting", "synthetic"},  # the last two: training of the embedded model
     "ingest": {"artifacts", "geometry"},
-    "generation": {"artifacts", "frontend", "geometry", "ingest", "splatting"},
+    "services": {"artifacts"},
+    "generation": {"artifacts", "frontend", "geometry", "ingest", "services", "splatting"},
     "adaptation": {"artifacts", "geometry", "models", "splatting"},
     "optimisation": {"artifacts", "evaluation", "geometry", "splatting"},
     "inference": {"artifacts", "geometry", "models"},
