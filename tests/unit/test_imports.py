@@ -24,7 +24,8 @@ ROOMS: dict[str, set[str]] = {
     "models": {"geometry", "frontend", "splatting", "synthetic"},  # the last two: training of the embedded model
     "ingest": {"artifacts", "geometry"},
     "services": {"artifacts"},
-    "generation": {"artifacts", "frontend", "geometry", "ingest", "services", "splatting"},
+    "judge": {"artifacts", "services"},
+    "generation": {"artifacts", "frontend", "geometry", "ingest", "judge", "services", "splatting"},
     "adaptation": {"artifacts", "geometry", "models", "splatting"},
     "optimisation": {"artifacts", "evaluation", "geometry", "splatting"},
     "inference": {"artifacts", "geometry", "models"},

@@ -26,6 +26,8 @@ PATH_KEYS = frozenset(
         "generator.file",
         "generator.workflow",
         "choose.candidate",
+        "judge.insertion_prompt",
+        "judge.quality_prompt",
         "rivals.omnivggt.weights",
         "rivals.ttt3r.weights",
     }
