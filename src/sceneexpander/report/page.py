@@ -8,6 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from sceneexpander.artifacts.judgement import JudgedRound
 from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
 from sceneexpander.artifacts.quantities import Quantity
 from sceneexpander.artifacts.store import read_json, write_bytes_atomic
@@ -15,6 +16,7 @@ from sceneexpander.report.cameras import FACTS, cameras_shown
 from sceneexpander.report.collect import MAIN_METHOD
 from sceneexpander.report.course import FITTED, fits, looks_shown, verdict, was_fitted
 from sceneexpander.report.curve import curve_chart, objective_curves, smoothing_window
+from sceneexpander.report.judged import load_judged, page_table
 from sceneexpander.report.words import LAYERS, PICTURE_KINDS, TABLES, method_words
 
 _ARROWS = {"higher": "\u2191", "lower": "\u2193", "": ""}
@@ -68,6 +70,7 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
         poster = max(method["stills"], key=lambda still: -abs(still["frame"] - method["inserted_frame"]))["rgb"]
         goal = method["inserted_frame"] / max(method["frames"], 1)
         methods.append({**method, "label": words.label, "short": words.short, "poster": poster, "goal": goal})
+    judged = load_judged(folder / f"round_{facts['number']}")
     curves, steps = objective_curves(facts["series"]), len(facts["series"].get("loss", ()))
     return {
         **{
@@ -81,7 +84,7 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
         "methods": methods,
         "main": MAIN_METHOD,
         "cameras": cameras_shown(facts["cameras"], _pictures(scene)),
-        "tables": [found for title, shown in TABLES if (found := _table(title, shown, methods, rows)) is not None],
+        "tables": _tables(methods, rows, judged),
         "left_out": _left_out(rows, _names(scene)),
         "meanings": [(method["label"], _method_meaning(method)) for method in methods],
         "unavailable": [
@@ -96,6 +99,13 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
         "fits": fits(facts["methods"]),
         "view_groups": _view_groups(facts, scene, methods, rows),
     }
+
+
+def _tables(
+    methods: Sequence[Mapping[str, Any]], rows: Mapping[str, MetricsRow], judged: JudgedRound | None
+) -> list[dict[str, Any]]:
+    found = [table for title, shown in TABLES if (table := _table(title, shown, methods, rows)) is not None]
+    return found if judged is None else [*found, page_table(judged, methods)]
 
 
 def _table(
