@@ -15,8 +15,6 @@ from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.services.pictures import SentPicture, encode_picture
 
-_SAME_CAMERA = 0.25  # of the way from one frame to the next
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shown:
@@ -47,9 +45,10 @@ def choose_frames(world_from_cam: Float[Tensor, "frame 4 4"], inserted_frame: in
     """
     frames = len(world_from_cam)
     last = frames - 1
-    step = (world_from_cam[1:] - world_from_cam[:-1]).flatten(1).norm(dim=1).median()
+    step = (world_from_cam[1:] - world_from_cam[:-1]).flatten(1).norm(dim=1).max()
     there_and_back = (world_from_cam - world_from_cam.flip(0)).flatten(1).norm(dim=1).max()
-    if float(there_and_back) <= _SAME_CAMERA * float(step):
+    # Key frames are whole frames, so the way back may be off by less than one.
+    if float(there_and_back) <= float(step):
         last = max(1, (frames - 1) // 2)
         inserted_frame = min(inserted_frame, frames - 1 - inserted_frame)
     spread = torch.linspace(0, last, min(count, last + 1)).round().long().tolist()

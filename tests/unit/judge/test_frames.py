@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from sceneexpander.artifacts.store import ArtifactError
+from sceneexpander.geometry.trajectory import navigation
 from sceneexpander.judge.frames import choose_frames, read_frames
 from sceneexpander.splatting.video import write_video
 
@@ -27,6 +28,19 @@ def test_there_and_back_is_shown_on_the_way_there(frames: int, turn: int) -> Non
     assert len(chosen) == min(8, turn + 1)
     gaps = np.diff(chosen)
     assert gaps.max() - gaps.min() <= 1, "evenly spread"
+
+
+@pytest.mark.parametrize("frames", [95, 96])
+def test_the_tour_is_a_way_there_and_back(frames: int) -> None:
+    """Whole frames at the key cameras make it a little uneven."""
+    keys = path_along(torch.tensor([0.0, 0.4, 1.5, 2.2]))
+    keys[:, 2, 3] = torch.tensor([0.0, 1.0, 0.7, 0.1])
+    tour, _ = navigation(keys, torch.eye(3).expand(4, 3, 3), frames, [0, 1, 2, 3, 2, 1, 0])
+    goal = int((tour[:, 0, 3] - 2.2).abs().argmin())
+    chosen = choose_frames(tour, goal, 8)
+    assert len(chosen) == 8
+    assert tour[list(chosen), 0, 3].diff().min() > 0, "no camera twice"
+    assert float((tour[chosen[-1], 0, 3] - 2.2).abs()) < 0.05
 
 
 def test_a_path_to_elsewhere_is_shown_whole_with_the_inserted_camera() -> None:
