@@ -24,7 +24,7 @@ def request_sheet(question: ChatQuestion) -> Image.Image:
         if isinstance(item, str):
             words = f"{words} {item}".strip()
         else:
-            picture = Image.open(io.BytesIO(item.png))
+            picture: Image.Image = Image.open(io.BytesIO(item.png))
             height = max(1, round(_TILE_WIDTH * picture.height / picture.width))
             tiles.append((words, picture.resize((_TILE_WIDTH, height), Image.Resampling.LANCZOS)))
             words = ""

@@ -25,7 +25,7 @@ def settings(service: Service, **changes: Any) -> ChatJudgeConfig:
     """The shipped settings, with this machine's address; ``changes`` of the chat model or of the judge."""
     config = parse_dataclass(ProjectConfig, compose(CONF, ["judge=openai"])).judge
     assert isinstance(config, ChatJudgeConfig)
-    given = {"base_url": f"{service.address}/v1", "key_variable": "TEST_KEY", "timeout_s": 20.0}
+    given: dict[str, Any] = {"base_url": f"{service.address}/v1", "key_variable": "TEST_KEY", "timeout_s": 20.0}
     given |= {name: changes.pop(name) for name in OF_CHAT if name in changes}
     return replace(config, chat=replace(config.chat, **given), **changes)
 

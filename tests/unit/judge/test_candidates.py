@@ -61,9 +61,11 @@ def test_a_score_counts_and_a_missing_one_does_not(
     ranking = judge_candidates(judge, scores, pictures, context, so_far)
     assert [score.candidate for score in ranking] == [3, 2, 0]
     best, unsaid, worst = ranking
-    assert (best.judge, best.total) == (1.0, pytest.approx(0.7))
+    assert best.judge == 1.0
+    assert best.total == pytest.approx(0.7)
     assert (unsaid.judge, unsaid.total) == (None, 0.5), "what is missing is not low"
-    assert (worst.judge, worst.total) == (0.125, pytest.approx(0.3625))
+    assert worst.judge == 0.125
+    assert worst.total == pytest.approx(0.3625)
     assert best.reason == "measured; judged 5.00 of 5 (1/2)"
     assert unsaid.reason == "measured; the judge did not say"
     assert b"move right 30 %, a bench" in service.asked[0].body
