@@ -77,7 +77,7 @@ class Tiny:
         )
         self.write(layout.selection(SCENE), {name: True for name in layout.METHODS if name not in layout.OURS})
         self.write(layout.CODE, hashes(TREE, HERE))
-        for kind in ("generator", "choice", "model", *layout.RIVALS):
+        for kind in ("generator", "choice", "judge", "model", *layout.RIVALS):
             link_files({}, folder / layout.given(SCENE, kind))
         link_files({"round_1": folder / "away/picture.png"}, folder / layout.given(SCENE, "generator"))
         link_files({"round_1": folder / "away/chosen.png"}, folder / layout.given(SCENE, "choice"))
