@@ -73,7 +73,7 @@ class Tiny:
             (folder / path).write_text(text)
         self.write(
             layout.config(SCENE),
-            dict.fromkeys(SECTIONS, 1) | {"evaluate": 1, "rivals": dict.fromkeys(layout.RIVALS, 1)},
+            dict.fromkeys(SECTIONS, 1) | {"evaluate": 1, "judge": 1, "rivals": dict.fromkeys(layout.RIVALS, 1)},
         )
         self.write(layout.selection(SCENE), {name: True for name in layout.METHODS if name not in layout.OURS})
         self.write(layout.CODE, hashes(TREE, HERE))
