@@ -37,7 +37,8 @@ def selection(scene: str) -> Path:
 def given(scene: str, kind: str) -> Path:
     """A folder of links to files that the configuration names, wherever they are: the pipeline depends on their bytes.
 
-    ``kind``: ``generator`` and ``choice`` (a link per round), ``model`` (weights), or a rival's name (weights).
+    ``kind``: ``generator`` and ``choice`` (a link per round), ``judge`` (a prompt per criterion), ``model`` (weights), or a rival's name
+    (weights).
     """
     return GIVEN / scene / kind
 
@@ -110,6 +111,11 @@ def packed(scene: str, number: int, method: str) -> Path:
 def metrics(scene: str, number: int, method: str) -> Path:
     """Metrics of a method's reconstruction."""
     return round_folder(scene, number) / "metrics" / f"{method}.json"
+
+
+def judged(scene: str, number: int) -> Path:
+    """The `JudgedRound` of a round."""
+    return round_folder(scene, number) / "judged"
 
 
 def statistics(stage: str, scene: str, number: int | None = None, method: str | None = None) -> Path:

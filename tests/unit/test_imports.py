@@ -24,7 +24,9 @@ ROOMS: dict[str, set[str]] = {
     "splatting": {"geometry"},
     "models": {"geometry", "frontend", "splatting", "synthetic"},  # the last two: training of the embedded model
     "ingest": {"artifacts", "geometry"},
-    "generation": {"artifacts", "frontend", "geometry", "ingest", "splatting"},
+    "services": {"artifacts"},
+    "judge": {"artifacts", "services"},
+    "generation": {"artifacts", "frontend", "geometry", "ingest", "judge", "services", "splatting"},
     "adaptation": {"artifacts", "geometry", "models", "splatting"},
     "optimisation": {"artifacts", "evaluation", "geometry", "splatting"},
     "inference": {"artifacts", "geometry", "models"},

@@ -58,6 +58,7 @@ class CandidateScore:
         sharpness: detail, relative to the captured views.
         novelty: share of the picture that shows what the scene so far does not; None without a pose.
         reason: the same in words.
+        judge: what a judge says, its scores of 1 to 5 brought to [0, 1]; None: none was asked, or it did not say.
     """
 
     candidate: int
@@ -69,6 +70,7 @@ class CandidateScore:
     sharpness: float
     novelty: float | None
     reason: str
+    judge: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

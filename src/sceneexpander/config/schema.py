@@ -14,6 +14,7 @@ from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import ChoiceConfig, GeneratorConfig
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
+from sceneexpander.judge.config import JudgeConfig
 from sceneexpander.optimisation.config import OptimiseConfig, RefineConfig
 from sceneexpander.ranges import Range, check_ranges
 from sceneexpander.reconstruction.loaded import ModelConfig
@@ -43,6 +44,7 @@ class ProjectConfig:
     optimise: OptimiseConfig
     render: RenderConfig
     evaluate: EvaluateConfig
+    judge: JudgeConfig
     tracking: TrackingConfig
 
     def __post_init__(self) -> None:

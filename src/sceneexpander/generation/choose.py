@@ -17,10 +17,12 @@ from sceneexpander.generation.assess import Assessed, assess
 from sceneexpander.generation.backends import make_generator
 from sceneexpander.generation.backends.stored import own_picture
 from sceneexpander.generation.config import AUTO, ChoiceConfig, GeneratorConfig
+from sceneexpander.generation.opinion import judge_candidates
 from sceneexpander.generation.protocol import Forecast, GenerationContext, SceneSoFar
 from sceneexpander.generation.rank import rank_candidates
 from sceneexpander.generation.sheet import contact_sheet
 from sceneexpander.ingest.load import view_from_fitted
+from sceneexpander.judge import Judge
 
 logger = logging.getLogger(__name__)
 
@@ -40,10 +42,11 @@ def choose_view(
     choice: ChoiceConfig,
     *,
     seed: int,
+    judge: Judge | None = None,
 ) -> ChosenView:
     """The picture that a round inserts, in the frame of the views so far.
 
-    ``auto`` ranks the usable candidates, see `rank_candidates`; a single one needs no ranking.
+    ``auto`` ranks the usable candidates, see `rank_candidates`; a single one needs no ranking. ``judge``, if there is one, has a say in it.
 
     Raises:
         UserError: there is no such candidate, or it is unusable.
@@ -51,7 +54,10 @@ def choose_view(
     assessed = [assess(item, so_far.views, choice.fit) for item in _with_own(context, candidates, choice)]
     ranking: tuple[CandidateScore, ...] = ()
     if choice.candidate == AUTO and sum(item.fitted is not None for item in assessed) > 1:
-        ranking = rank_candidates([item.fitted for item in assessed], so_far, seed=seed)
+        fitted = [item.fitted for item in assessed]
+        ranking = rank_candidates(fitted, so_far, seed=seed)
+        if judge is not None and judge.config.candidates:
+            ranking = judge_candidates(judge, ranking, fitted, context, so_far)
     chosen = ranking[0].candidate if ranking else _picked(assessed, choice, context)
     if ranking:
         logger.info("round %d: candidate %d: %s", context.round_number, chosen, ranking[0].reason)
