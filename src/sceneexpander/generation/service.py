@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any, Protocol
 
@@ -112,10 +113,11 @@ class ServiceGenerator:
         missing = max(0, self.config.candidates - self._cache(context).count())
         if missing:
             self.service.require()
-        price = self.config.price_usd
+        price, spent = self.config.price_usd, read_spent(spent_ledger(context))
         shown = min(self.config.max_references, len(context.captured) + context.round_number - 1)
         notes = (
             f"shows the {shown} views nearest to where the motion leads, at most {self.config.reference_side_px} px long",
+            *([f"{len(spent)} requests were sent for this scene before"] if spent else []),
         )
         return Forecast(
             prompt=fill_prompt(context.spec),
@@ -131,7 +133,7 @@ class ServiceGenerator:
             context, so_far, limit=config.max_references, long_side_px=config.reference_side_px
         )
         keys = {reference.view_id: reference.pixels_sha256 for reference in references}
-        cache, budget = self._cache(context), _Budget(config)
+        cache, budget = self._cache(context), _Budget(config, spent_ledger(context))
         candidates: list[Candidate] = []
         outcomes: list[Outcome] = []
         errors: list[ServiceError] = []
@@ -244,21 +246,63 @@ class ServiceGenerator:
 
 @dataclass(slots=True)
 class _Budget:
-    """Looked at before anything is sent."""
+    """Looked at before anything is sent. ``ledger``: a line for every request that was ever sent for the scene, in whatever round."""
 
     config: ServiceConfig
+    ledger: Path
     sent: int = 0
 
     def spend(self) -> None:
         """Count one request. Raises `ServiceError` if it is one too many."""
-        config = self.config
-        if self.sent >= config.max_requests:
-            problem = f"{self.sent} requests were sent, as many as generator.max_requests allows"
-            raise ServiceError("failed_final", problem, fix="raise it and start again: what came is kept")
-        if config.max_cost_usd is not None and (self.sent + 1) * (config.price_usd or 0.0) > config.max_cost_usd:
-            problem = f"one more picture would cost more than generator.max_cost_usd ({config.max_cost_usd:g})"
-            raise ServiceError("failed_final", problem, fix="raise it and start again: what came is kept")
+        config, price = self.config, self.config.price_usd or 0.0
+        prices = read_spent(self.ledger)
+        limits = (
+            (self.sent + 1 > config.max_requests, "generator.max_requests", f"{self.sent} requests were sent"),
+            (
+                _beyond((self.sent + 1) * price, config.max_cost_usd),
+                "generator.max_cost_usd",
+                "the round is paid up to it",
+            ),
+            (
+                config.max_scene_requests is not None and len(prices) + 1 > config.max_scene_requests,
+                "generator.max_scene_requests",
+                f"{len(prices)} requests were sent for the scene so far",
+            ),
+            (
+                _beyond(sum(prices) + price, config.max_scene_cost_usd),
+                "generator.max_scene_cost_usd",
+                f"pictures for {sum(prices):.2f} USD were asked for so far",
+            ),
+        )
+        for reached, name, so_far in limits:
+            if reached:
+                problem = f"{so_far}: one more is beyond {name}"
+                raise ServiceError("failed_final", problem, fix="raise it and start again: what came is kept")
         self.sent += 1
+        # Before the request: one that is killed on its way is paid for, too.
+        self.ledger.parent.mkdir(parents=True, exist_ok=True)
+        with self.ledger.open("a", encoding="utf-8") as file:
+            file.write(f"{price!r}\n")
+
+
+def _beyond(cost: float, limit: float | None) -> bool:
+    return limit is not None and cost > limit + 1e-9
+
+
+def spent_ledger(context: GenerationContext) -> Path:
+    """The file that remembers the requests sent for a scene."""
+    return context.cache / "spent" / f"{context.scene}.txt"
+
+
+def read_spent(ledger: Path) -> list[float]:
+    """Prices (USD, 0 where none was configured) of all requests in a ledger. Raises `UserError` for a damaged one."""
+    if not ledger.is_file():
+        return []
+    try:
+        return [float(line) for line in ledger.read_text(encoding="utf-8").split()]
+    except ValueError:
+        fix = "remove it to start counting anew"
+        raise UserError("is damaged, so what was spent is not known", where=ledger, fix=fix) from None
 
 
 @contextmanager

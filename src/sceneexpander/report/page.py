@@ -77,6 +77,8 @@ def _round(facts: Mapping[str, Any], scene: Mapping[str, Any], folder: Path) -> 
         "made": PICTURE_KINDS.get(facts["source_type"], "Picture"),
         "reasons": [f"candidate {score['candidate']}: {score['reason']}" for score in facts["ranking"]],
         "sheet": facts["sheet"] if facts["candidates"] > 1 else None,
+        "overlay": facts["overlay"],
+        "misalignment": facts["misalignment"],
         "warnings": facts["warnings"],
         "methods": methods,
         "main": MAIN_METHOD,

@@ -83,6 +83,7 @@ def _run(
             "mlflow.source.git.commit": commit,
             NOTE_TAG: run_note(item["prompt"], name, row, cameras, item["warnings"]),
             **_camera_tags(cameras),
+            **({"misalignment": cut(item["misalignment"])} if item["misalignment"] else {}),
             **({LIVE_TAG: item["looks"]["identity"]} if adapted and item["looks"] else {}),
         },
         started_ms=int(1000 * min((entry["started"] for entry in stages.values()), default=0.0)),
@@ -154,6 +155,8 @@ def _artefacts(
     found = {"inserted/" + Path(item["inserted"]).name: folder / item["inserted"]}
     if item["sheet"]:
         found["inserted/" + Path(item["sheet"]).name] = folder / item["sheet"]
+    if item["overlay"]:
+        found["inserted/" + Path(item["overlay"]).name] = folder / item["overlay"]
     for path in method["videos"].values():
         found["videos/" + Path(path).name] = folder / path
     for still in method["stills"]:
