@@ -83,10 +83,13 @@ def report_misalignment(picture: FittedPicture, so_far: SceneSoFar, *, seed: int
 def tone_gains(
     own: Float[Tensor, "3 height width"], scene: Float[Tensor, "3 height width"], cover: Bool[Tensor, "height width"]
 ) -> Float[Tensor, "3"]:
-    """By what the scene's colours are multiplied to have the picture's exposure and white balance: medians over what both show."""
+    """By what the scene's colours are multiplied to have the picture's exposure and white balance: median ratio of pixels that both show.
+
+    Of ratios, not the ratio of medians: an object that only one of them shows must not change the tone of the rest.
+    """
     if int(cover.sum()) < _FEWEST_CELLS * _CELL_PX**2:
         return torch.ones(3)
-    return (own[:, cover].median(1).values / scene[:, cover].median(1).values.clamp(min=1e-3)).clamp(0.25, 4)
+    return (own[:, cover] / scene[:, cover].clamp(min=1e-3)).median(1).values.clamp(0.25, 4)
 
 
 def contradicted(

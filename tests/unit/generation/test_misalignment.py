@@ -56,6 +56,7 @@ def test_what_the_photos_show_otherwise_is_marked_where_it_is(
     pixels[80:160, 120:240] = (250, 0, 250)  # an object that is not there
     found = report_misalignment(fitted(pixels), so_far, seed=0)
     assert found.support is not None
+    assert found.report.gains == pytest.approx((1, 1, 1), abs=0.02), "the object does not change the tone of the rest"
     inside = found.support[44:76, 64:116]
     assert float(inside.mean()) < 0.05
     outside = found.support.clone()
