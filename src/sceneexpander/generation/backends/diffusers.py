@@ -206,7 +206,8 @@ class DiffusersService:
             check_folder(folder)
             from diffusers import AutoPipelineForInpainting, DiffusionPipeline
 
-            pipeline = DiffusionPipeline.from_pretrained(
+            library: Any = DiffusionPipeline  # untyped
+            pipeline = library.from_pretrained(
                 str(folder),
                 dtype=getattr(torch, config.precision),
                 use_safetensors=True,
