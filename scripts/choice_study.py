@@ -34,7 +34,12 @@ from sceneexpander.project import find_project
 
 GRADES = "mixed_1,mixed_2,mixed_4,stretch_8,zoom_10,hallucinate"
 # What an expansion is judged by, and whether more of it is better.
-OUTCOMES = {"new_psnr_db": True, "between_psnr_db": True, "psnr_db": True, "new_depth_abs_rel": False}
+OUTCOMES = {
+    "psnr_new_region_db": True,
+    "psnr_half_way_db": True,
+    "psnr_captured_db": True,
+    "new_region_drawn_abs_rel": False,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,8 +74,8 @@ def measure_scene(name: str, grades: Sequence[str], config: ProjectConfig, cache
     for index, (grade, case) in enumerate(zip(grades, cases, strict=True)):
         state, made, _ = correct_round(case.inputs, loaded, config.adapt, seed=config.seed)
         made, _ = refined_round(made, state, config.adapt, config.refine, seed=config.seed)
-        numbers = measure(made, case.inputs.state.views.append(case.inputs.inserted.view), case.truth, scene).plain()
-        outcomes = {outcome: numbers[outcome] for outcome in OUTCOMES}
+        numbers = measure(made, case.inputs.state.views.append(case.inputs.inserted.view), case.truth, scene).values
+        outcomes = {outcome: numbers.get(outcome) for outcome in OUTCOMES}
         measured.append(Candidate(scene=name, grade=grade, score=scores[index], outcomes=outcomes))
     return measured
 
@@ -103,7 +108,7 @@ def lines(candidates: Sequence[Candidate]) -> list[str]:
             draws = np.random.default_rng(0).choice(taken, size=(2000, len(taken))).mean(1)
             low, high = np.quantile(draws, [0.025, 0.975])
             made.append(
-                f"{outcome:18s} by {name:13s} {taken.mean():+.3f} [{low:+.3f}, {high:+.3f}] "
+                f"{outcome:24s} by {name:13s} {taken.mean():+.3f} [{low:+.3f}, {high:+.3f}] "
                 f"better in {int((taken > 0).sum())} of {len(scenes)}; best possible {best.mean():+.3f}"
             )
     return made

@@ -33,7 +33,7 @@ from sceneexpander.project import find_project
 from sceneexpander.reconstruction.loaded import LoadedModel
 
 GRADES = "clean,stretch_4,stretch_8,zoom_10,zoom_20,shift_5,mixed_2,hallucinate"
-OUTCOMES = ("new_psnr_db", "between_psnr_db", "psnr_db")
+OUTCOMES = ("psnr_new_region_db", "psnr_half_way_db", "psnr_captured_db")
 
 
 def hallucinated(scene: BenchScene, grade: Grade) -> np.ndarray:
@@ -81,8 +81,8 @@ def outcomes(
         opacities[own] *= torch.where(inside[0], there[0, 0], 1.0)
         made = replace(made, gaussians=replace(made.gaussians, opacities=opacities))
     made, _ = refined_round(made, state, config.adapt, config.refine, seed=config.seed)
-    numbers = measure(made, inputs.state.views.append(inputs.inserted.view), truth, scene).plain()  # type: ignore[arg-type]
-    return {name: numbers[name] for name in OUTCOMES}
+    numbers = measure(made, inputs.state.views.append(inputs.inserted.view), truth, scene).values  # type: ignore[arg-type]
+    return {name: numbers.get(name) for name in OUTCOMES}
 
 
 def study_scene(name: str, options: argparse.Namespace, config: ProjectConfig) -> None:
