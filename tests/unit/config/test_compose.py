@@ -19,7 +19,7 @@ from sceneexpander.config.schema import ProjectConfig
 
 CONF = Path(__file__).parents[3] / "conf"
 NEEDED = {"model=worldmirror": ["model.weights=x.safetensors"], "generator=file": ["generator.file=x.png"]}
-NEEDED |= {"generator=comfyui": ["generator.workflow=x.json"]}
+NEEDED |= {"generator=comfyui": ["generator.workflow=x.json"], "generator=diffusers": ["generator.model=x/y"]}
 NEEDED |= {"tracking=server": ["tracking.uri=http://127.0.0.1:5000"]}
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
 OPTIONS = sorted(f"{group}={path.stem}" for group in GROUPS for path in (CONF / group).glob("*.yaml"))
