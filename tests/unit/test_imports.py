@@ -65,6 +65,13 @@ ROOMS: dict[str, set[str]] = {
     "tracking": {"artifacts", "evaluation"},
     "viewer": {"artifacts", "geometry", "splatting"},
     "report": {"artifacts", "evaluation", "viewer"},
+    "study": {
+        "artifacts",
+        "evaluation",
+        "geometry",
+        "splatting",
+        "viewer",
+    },  # the last one: which hosts and origins a server answers
     "conformance": {"artifacts", "geometry", "models", "splatting"},  # a command: runs recorded cases
 }
 # Entry points and what only they share: they may import every room, and no room imports them.
