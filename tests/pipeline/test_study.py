@@ -75,9 +75,10 @@ def place(tab: Page, person: Person) -> str:
     screen = next(item for item in person.participant.screens if item.name == name)
     ranks = person.ranks(name)
     for index, video in enumerate(screen.videos):
-        tab.value(
-            f"document.querySelectorAll('fieldset')[{index}].querySelectorAll('.places button')[{ranks[video] - 1}].click()"
+        button = (
+            f"document.querySelectorAll('fieldset')[{index}].querySelectorAll('.places button')[{ranks[video] - 1}]"
         )
+        tab.value(f"if (places[{index}] !== {ranks[video]}) {button}.click()")  # a second click takes a place back
     return name
 
 

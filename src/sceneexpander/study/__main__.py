@@ -9,6 +9,7 @@ agree    Kendall's tau between people and metrics or a judge
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -99,7 +100,8 @@ def _serve(given: argparse.Namespace) -> None:
     listener = bind(host, port)
     shown = f"[{host}]" if ":" in host else host
     print(f"study: http://{shown}:{listener.getsockname()[1]} (stop with Ctrl-C; answers are kept)", flush=True)
-    server.run(sockets=[listener])
+    with contextlib.suppress(KeyboardInterrupt):  # uvicorn has ended what it was doing
+        server.run(sockets=[listener])
 
 
 def _results(given: argparse.Namespace) -> None:
