@@ -113,7 +113,9 @@ def _read_rows(folder: Path) -> list[Measured]:
     if not rows:
         raise UserError("holds no metrics", where=folder, fix="run the pipeline, or give a CSV file")
     found = [
-        Measured(scene=row.scene, method=row.method, measure=item.title, better=item.better, value=row.value(item.name))
+        Measured(
+            scene=row.scene, method=row.method, measure=item.tracked, better=item.better, value=row.value(item.name)
+        )
         for row in rows
         for item in MEASURED
         if item.better in ("higher", "lower")
@@ -142,8 +144,9 @@ def compute_agreement(ranked: RankedStudy, measured: Sequence[Measured], *, seed
     """Each measure against each criterion; the first line of a criterion is how far people agree among themselves.
 
     Raises:
-        UserError: no measure has a value for a scene and a method of the study.
+        UserError: no measure has a value for a scene and a method of the study, or something is measured twice.
     """
+    _refuse_doubles(measured, Path("--measures"))
     values = {(item.measure, item.scene, item.method): item for item in measured if item.value is not None}
     names = list(dict.fromkeys(item.measure for item in measured))
     known = {(scene, method) for scene in ranked.scenes for method in ranked.methods}

@@ -225,6 +225,12 @@ def test_tau_between_people_and_measures_by_hand() -> None:
     assert {len(line) for line in table.lines} == {len(table.header)}
 
 
+def test_what_two_files_say_about_the_same_thing_is_refused() -> None:
+    twice = measure("m", "higher", 3, 2, 1, 3, 2, 1) + measure("m", "higher", 1, 2, 3, 1, 2, 3)
+    with pytest.raises(UserError, match="has 'm' of 'a' in scene 'one' twice"):
+        compute_agreement(ranked_by([[1, 2, 3], [1, 2, 3]]), twice)
+
+
 def test_measures_of_other_scenes_are_refused() -> None:
     ranked = ranked_by([[1, 2, 3], [1, 2, 3]])
     stranger = [Measured(scene="three", method="a", measure="m", better="higher", value=1.0)]
