@@ -30,6 +30,7 @@ COMMANDS = (
     Command(
         "study", "sceneexpander.study.__main__", "let people rank videos of methods blindly, and compute what they said"
     ),
+    Command("export", "sceneexpander.export", "write a finished scene as PLY, SPZ, GLB, mesh, COLMAP, nerfstudio, ..."),
     Command("ui", "sceneexpander.ui", "open all recorded runs in the browser, running ones live"),
     Command("follow", "sceneexpander.follow", "mirror running adaptations into MLflow without the browser"),
     Command(

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from sceneexpander.artifacts.metrics import MetricsRow, load_row
-from sceneexpander.artifacts.quantities import MEASURED
 from sceneexpander.artifacts.store import to_plain, write_bytes_atomic, write_json_atomic
+from sceneexpander.catalogue.metrics import MEASURED
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.table import Table
 from sceneexpander.plainfiles import read_plain_file
@@ -113,9 +113,7 @@ def _read_rows(folder: Path) -> list[Measured]:
     if not rows:
         raise UserError("holds no metrics", where=folder, fix="run the pipeline, or give a CSV file")
     found = [
-        Measured(
-            scene=row.scene, method=row.method, measure=item.tracked, better=item.better, value=row.value(item.name)
-        )
+        Measured(scene=row.scene, method=row.method, measure=item.name, better=item.better, value=row.value(item.name))
         for row in rows
         for item in MEASURED
         if item.better in ("higher", "lower")

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sceneexpander.artifacts.quantities import METHOD_TITLES
 from sceneexpander.artifacts.store import to_plain, write_bytes_atomic, write_json_atomic
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.table import Table
@@ -262,7 +261,7 @@ def score_table(results: StudyResults) -> Table:
         header += [f"{item.criterion.column} ↑", "95 %", "first"]
     lines = []
     for index, scored in enumerate(results.criteria[0].methods):
-        line = [METHOD_TITLES.get(scored.method, scored.method)]
+        line = [scored.method]
         for item in results.criteria:
             method = item.methods[index]
             line += [f"{method.mean:.2f}", _interval_text(method.interval), f"{100 * method.first_share:.0f} %"]
@@ -275,8 +274,8 @@ def pair_table(results: StudyResults) -> Table:
     lines = [
         (
             item.criterion.column,
-            METHOD_TITLES.get(pair.first, pair.first),
-            METHOD_TITLES.get(pair.second, pair.second),
+            pair.first,
+            pair.second,
             f"{pair.difference:+.2f}",
             _interval_text(pair.interval),
             _p_text(pair.p),

@@ -96,4 +96,4 @@ def degrade_video(source: Path, target: Path, share: float, rng: np.random.Gener
                 pixels = torch.from_numpy(frame.to_ndarray(format="rgb24")).permute(2, 0, 1).float() / 255
                 yield pixels * (1 - share) + noise * share
 
-        write_video(frames(), target, float(track.average_rate))
+        write_video(frames(), target, float(track.average_rate or 0))
