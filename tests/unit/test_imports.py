@@ -65,6 +65,14 @@ ROOMS: dict[str, set[str]] = {
         "splatting",
         "synthetic",
     },
+    "study": {
+        "artifacts",
+        "catalogue",
+        "evaluation",
+        "geometry",
+        "splatting",
+        "viewer",
+    },  # the last: which hosts are answered
     "exports": {"artifacts", "geometry", "splatting", "viewer"},  # the last: which Gaussians are seen most
     "rendering": {"artifacts", "evaluation", "exports", "geometry", "splatting"},
     "tracking": {"artifacts", "catalogue", "evaluation"},
