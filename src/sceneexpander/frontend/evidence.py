@@ -44,8 +44,8 @@ class ViewEvidence:
             pictures alone leave it uncertain; 0 where they are shared or known from elsewhere.
         rival_angle_deg: how far the directions to the others move if it stood where a flat surface would look the same; 0 where relief
             or a third view rules that out.
-        spread_deg: how far the directions to the others move to cameras of another focal, or of another centre for a part cut out of a
-            photo, that explain the photos about as well.
+        spread_deg: how far the directions to the others move to cameras of another focal (of all views or of this one alone), or of another
+            centre for a part cut out of a photo, that explain the photos about as well.
     """
 
     agreeing: float
