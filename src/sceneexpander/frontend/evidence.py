@@ -72,6 +72,8 @@ class ViewEvidence:
         """Why the camera is only roughly right; empty if there is no such reason."""
         if self.agreeing < config.sure_agreeing:
             return f"only {self.agreeing:.0%} of its matches with other photos agree with its camera"
+        if self.rotation_gap_deg > config.sure_rotation_gap_deg:
+            return f"its turns against other photos, pair by pair, are {self.rotation_gap_deg:.0f} degrees off"
         if self.direction_sigma_deg > config.max_direction_deg:
             return (
                 "the photos were taken from nearly one place: directions between cameras may be off by"

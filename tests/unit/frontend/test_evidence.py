@@ -114,7 +114,13 @@ def test_each_kind_of_evidence_can_fail(change: dict[str, float], said: str) -> 
 
 
 def test_doubts_are_no_refusals() -> None:
-    for change in ({"agreeing": 0.6}, {"direction_sigma_deg": 20.0}, {"rival_angle_deg": 20.0}, {"spread_deg": 20.0}):
+    for change in (
+        {"agreeing": 0.6},
+        {"rotation_gap_deg": 12.0},
+        {"direction_sigma_deg": 20.0},
+        {"rival_angle_deg": 20.0},
+        {"spread_deg": 20.0},
+    ):
         found = replace(FINE, **change)
         assert found.doubt(CONFIG)
         assert not found.refusal(CONFIG)
