@@ -22,9 +22,10 @@ from sceneexpander.frontend.matching import Matches
 from sceneexpander.frontend.memory import MatchMemory
 
 SCHEMA = "matches/1"
-_MATCHES = {"index_a": (torch.int64, (-1,)), "index_b": (torch.int64, (-1,)), "ratio": (torch.float64, (-1,))}
+_Entry = dict[str, tuple[torch.dtype, tuple[int, ...]]]
+_MATCHES: _Entry = {"index_a": (torch.int64, (-1,)), "index_b": (torch.int64, (-1,)), "ratio": (torch.float64, (-1,))}
 # Of each table what an entry holds: number type and shape, -1 for any length.
-_ENTRIES: dict[str, dict[str, tuple[torch.dtype, tuple[int, ...]]]] = {
+_ENTRIES: dict[str, _Entry] = {
     "features": {"pixel_xy": (torch.float64, (-1, 2)), "descriptors": (torch.float32, (-1, 128))},
     "described": _MATCHES,
     "keypoints": {
