@@ -26,9 +26,9 @@ from sceneexpander import preflight
 from sceneexpander.errors import UserError, printable
 from sceneexpander.expand import Request, expand, run_name, stage_scene
 from sceneexpander.generation import Forecast
+from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.preflight import CheckedScene
 from sceneexpander.selection import read_selection
-from sceneexpander.workspace import run_lock
 from tests.unit.ingest.test_survey import texture
 
 ROOT = Path(__file__).parents[2]
@@ -110,7 +110,7 @@ def test_names_of_the_pipelines_own_are_refused(name: str, project: Path, tmp_pa
 @contextmanager
 def somebody_at_work(folder: Path) -> Iterator[int]:
     script = (
-        "import sys, time; from pathlib import Path; from sceneexpander.workspace import run_lock\n"
+        "import sys, time; from pathlib import Path; from sceneexpander.pipeline.locks import run_lock\n"
         f"with run_lock(Path({str(folder)!r})): print('at work', flush=True); time.sleep(60)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -164,7 +164,7 @@ def test_a_killed_start_leaves_no_child_and_no_lock(tmp_path: Path) -> None:
     script = f"""
 from pathlib import Path
 from sceneexpander.processes import kept
-from sceneexpander.workspace import run_lock
+from sceneexpander.pipeline.locks import run_lock
 with run_lock(Path({str(folder)!r})) as lock:
     with kept(["sleep", "60"], cwd=Path({str(tmp_path)!r}), held=(lock.descriptor,)) as process:
         print(process.pid, flush=True)

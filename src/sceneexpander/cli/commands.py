@@ -22,6 +22,7 @@ class Command:
 
 COMMANDS = (
     Command("expand", "sceneexpander.expand", "expand the scene of a folder of photos by a picture and a sentence"),
+    Command("run", "sceneexpander.pipeline.plain", "bring the project's pipeline up to date without DVC"),
     Command("sweep", "sceneexpander.sweep", "run the pipeline for many combinations of settings"),
     Command("ablation", "sceneexpander.ablation", "measure what each part of the method does, against known truth"),
     Command("plan", "sceneexpander.plan", "tell memory and operations in advance, without a GPU or weights"),
