@@ -13,6 +13,7 @@ from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.reconstruction.cameras import report_cameras
 from sceneexpander.reconstruction.fitting import fitted
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+from sceneexpander.reconstruction.memory import load_memory
 from sceneexpander.reconstruction.views import joint_reconstruction
 from stages import layout
 from stages.machine import use_machine
@@ -40,7 +41,12 @@ def main(cell: Cell) -> None:
     inserted = InsertedView.load(layout.inserted(cell.scene, cell.round))
     loaded = load_model(sections.model, sections.device)
     priors, reconstruction, sparse = joint_reconstruction(
-        state, inserted, loaded, sections.frontend, seed=sections.seed
+        state,
+        inserted,
+        loaded,
+        sections.frontend,
+        seed=sections.seed,
+        memory=load_memory(layout.match_memory(cell.scene)),
     )
     reconstruction, fit = fitted(
         reconstruction,

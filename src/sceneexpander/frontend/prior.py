@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, checked_share, dense_depth
 from sceneexpander.frontend.lenses import ViewOptics
+from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.sfm import Judge, estimate_cameras
 from sceneexpander.frontend.sfm_types import SfmConfig, SparseReconstruction
 from sceneexpander.geometry.priors import Priors
@@ -39,6 +40,7 @@ def build_priors(
     names: Sequence[str] | None = None,
     optics: Sequence[ViewOptics] | None = None,
     valid: Bool[Tensor, "view height width"] | None = None,
+    memory: MatchMemory | None = None,
 ) -> tuple[Priors, SparseReconstruction]:
     """Everything a reconstructor can be told about S >= 1 views; arguments as in `sfm.estimate_cameras`.
 
@@ -55,6 +57,7 @@ def build_priors(
         names=names,
         optics=optics,
         valid=valid,
+        memory=memory,
         judge=picture_judge(images, config.dense),
     )
     dense = dense_depth(

@@ -12,6 +12,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
 from sceneexpander.geometry.gauge import in_gauge_of
@@ -31,10 +32,12 @@ def views_priors(
     *,
     seed: int,
     known: KnownCameras | None = None,
+    memory: MatchMemory | None = None,
 ) -> tuple[Priors, SparseReconstruction | None]:
     """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing.
 
     ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told.
+    ``memory`` spares it pictures and pairs that it has seen before, and learns those that it has not.
     """
     if not loaded.uses_front_end:
         return Priors(), None
@@ -53,6 +56,7 @@ def views_priors(
         names=[record.name for record in views.records],
         optics=optics_of(views),
         valid=views.valid,
+        memory=memory,
     )
 
 
@@ -104,14 +108,16 @@ def joint_reconstruction(
     frontend: FrontendConfig,
     *,
     seed: int,
+    memory: MatchMemory | None = None,
 ) -> tuple[Priors, Reconstruction, SparseReconstruction | None]:
     """The baseline: the unadapted model given all views as they are, the inserted one last and treated like any other.
 
     In every round: its weights are those of round 0, and no picture is in another tone. The priors come back in the frame and scale of
     the state's, so that what was known before can be compared with them; the front-end's own findings are in their own scale.
+    ``memory`` is that of round 0.
     """
     views = state.views.append(inserted.view)
-    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known)
+    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known, memory=memory)
     priors = in_gauge_of(state.priors, priors)
     if sparse is not None:
         announce_cameras(
