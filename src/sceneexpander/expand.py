@@ -131,6 +131,7 @@ def stage_scene(
         UserError: the folder, a picture or an option is unusable.
     """
     photos = request.photos
+    require_readable(photos)
     words = (request.prompts, request.motions, request.objects, request.inserted)
     if (photos / SCENE_FILE).is_file():
         if any(words):
@@ -203,8 +204,12 @@ def _at(items: Sequence[str], index: int) -> str:
 
 def require_readable(place: Path) -> None:
     """Raise `UserError` unless ``place`` leads to a folder or a plain file."""
-    if not place.is_dir():
-        require_plain_file(place)
+    try:
+        if place.is_dir():
+            return
+    except (OSError, ValueError):
+        pass  # the next call says what is wrong
+    require_plain_file(place)
 
 
 def run_name(request: Request) -> str:

@@ -43,7 +43,11 @@ def find_source(place: Path, name: str = AUTO, *, where: str | Path = "source") 
     """
     if name != AUTO:
         if name not in SOURCES:
-            raise UserError(f"unknown source {name!r}", where=where, fix=did_you_mean(name, (AUTO, *SOURCES)))
+            raise UserError(
+                f"unknown source {name!r}",
+                where=where,
+                fix=f"{did_you_mean(name, (AUTO, *SOURCES))} (where data is from is 'origin:')",
+            )
         return name
     found = next((known for known, source in SOURCES.items() if source.detect(place)), None)
     if found is None:
