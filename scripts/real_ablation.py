@@ -15,6 +15,7 @@ import torch
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet, save_png
+from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
@@ -45,9 +46,9 @@ def composed(row: str, overrides: list[str]) -> ProjectConfig:
 def line(name: str, reconstruction: Reconstruction, views: ViewSet) -> str:
     """The numbers of one row."""
     row = evaluate(reconstruction, views, EvaluateConfig(), scene="-", round_number=1, seed=0)
-    inserted = "     -" if row.inserted_psnr_db is None else f"{row.inserted_psnr_db:6.2f}"
-    others = "     -" if row.others_psnr_db is None else f"{row.others_psnr_db:6.2f}"
-    return f"{name:24s} PSNR {row.psnr_db:6.2f}  SSIM {row.ssim:.3f}  cross-view {others}  insertion {inserted}"
+    shown = metrics_named("psnr_captured_db", "ssim_captured", "psnr_from_others_db", "psnr_inserted_db")
+    numbers = "  ".join(f"{metric.title} {metric.text_with_unit(row.value(metric.name))}" for metric in shown)
+    return f"{name:24s} {numbers}"
 
 
 def pictures(reconstruction: Reconstruction, path: Path) -> None:

@@ -17,6 +17,7 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from sceneexpander.artifacts.page import flatten
 from sceneexpander.errors import entry_point
 from sceneexpander.models.mini import Mini, MiniConfig
 from sceneexpander.models.mini.training.buffer import fill_buffer, sample_path, stored_indices
@@ -27,7 +28,7 @@ from sceneexpander.models.weights import resolve_weights
 from sceneexpander.project import find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.curve import CurveRun
-from sceneexpander.tracking.record import flatten, run_key
+from sceneexpander.tracking.record import run_key
 
 MIN_SAMPLES = 40  # in the buffer before training starts
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from sceneexpander.artifacts.page import flatten
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_yaml, write_yaml
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene
+from sceneexpander.selection import Selection, read_selection
 from stages import layout
 from stages.resolve import read_overrides
 from stages.runner import Cell, stage
 
 
-def _round(scene: str, number: int, methods: list[str]) -> RoundSource:
+def _round(scene: str, number: int, methods: Sequence[str]) -> RoundSource:
     return RoundSource(
         number=number,
         inserted=layout.inserted(scene, number),
@@ -36,10 +38,12 @@ def _round(scene: str, number: int, methods: list[str]) -> RoundSource:
     )
 
 
-def _gaussians(scene: str, selected: dict[str, Any]) -> dict[str, str]:
+def _gaussians(scene: str, selected: Selection) -> dict[str, str]:
     """Hash by path of every file of Gaussians that there is."""
     paths = [
-        layout.gaussians(scene, item["k"], method) for item in selected["rounds"] for method in selected["methods"]
+        layout.gaussians(scene, number, method)
+        for number in range(1, selected.rounds + 1)
+        for method in selected.methods
     ]
     found: dict[str, str] = {}
     for path in paths:
@@ -52,20 +56,21 @@ def _gaussians(scene: str, selected: dict[str, Any]) -> dict[str, str]:
 @stage("scene")
 def main(cell: Cell) -> None:
     """List artefacts by what params.yaml selects: files of rounds or methods that were taken out may still lie there."""
-    selected: dict[str, Any] = read_yaml(Path("params.yaml"))
+    selected = read_selection(Path())
+    config = read_yaml(layout.config(cell.scene))
     source = SceneSource(
         scene=layout.prepared(cell.scene),
         report=layout.state(cell.scene, 0) / "report.json",
         statistics=layout.OUTPUTS / cell.scene / "stats",
-        rounds=[_round(cell.scene, item["k"], selected["methods"]) for item in selected["rounds"]],
-        config=read_yaml(layout.config(cell.scene)),
+        rounds=[_round(cell.scene, number, selected.methods) for number in range(1, selected.rounds + 1)],
+        settings=flatten(config),
         overrides=read_overrides(Path("params.yaml")),
         cameras=layout.cameras(layout.state(cell.scene, 0)),
     )
     with directory_being_written(layout.PAGES / cell.scene) as folder:
         collect_scene(source, folder)
         # For the recording, which depends on the gathered folders alone.
-        write_yaml(folder / layout.PAGE_CONFIG, source.config)
+        write_yaml(folder / layout.PAGE_CONFIG, config)
         write_json_atomic(folder / layout.PAGE_GAUSSIANS, _gaussians(cell.scene, selected))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from sceneexpander.artifacts.metrics import Fit, UnavailableRow
 from sceneexpander.artifacts.store import read_json
 from sceneexpander.artifacts.unavailable import unavailable_in
+from sceneexpander.catalogue import Kind, method_named
 from sceneexpander.config.files import read_sections
 from sceneexpander.evaluation.config import EvaluateConfig
 from stages import layout
@@ -43,7 +44,8 @@ def main(cell: Cell) -> None:
     from sceneexpander.artifacts.reconstruction import Reconstruction
     from sceneexpander.artifacts.renders import Renders
     from sceneexpander.artifacts.views import ViewSet
-    from sceneexpander.evaluation.evaluate import Navigation, evaluate
+    from sceneexpander.evaluation.evaluate import evaluate
+    from sceneexpander.evaluation.measure import Navigation
     from sceneexpander.evaluation.repeats import over_repeats
     from sceneexpander.evaluation.truth import load_truth
     from stages.machine import use_machine
@@ -77,7 +79,7 @@ def main(cell: Cell) -> None:
 
 def fit_of(cell: Cell) -> Fit:
     """What was done to the method's Gaussians after they were predicted."""
-    if cell.method in layout.OPTIMISED:
+    if method_named(cell.method).kind is Kind.OPTIMISED:
         return Fit.OPTIMISED
     found = layout.reconstruction(cell.scene, cell.round, cell.method).parent / layout.REFINEMENT
     if not found.is_file():

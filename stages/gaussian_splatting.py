@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stages.optimise import Sections, optimise_from
+from stages.optimise import Sections, optimise_start
 from stages.runner import Cell, left_out, stage
 
 __all__ = ["Sections", "main"]
@@ -12,7 +12,7 @@ __all__ = ["Sections", "main"]
 def main(cell: Cell) -> None:
     """The same optimisation as after the fact, as a baseline of its own."""
     if not left_out(cell):
-        optimise_from(cell, "backbone", stage_name="gaussian_splatting")
+        optimise_start(cell, stage_name="gaussian_splatting")
 
 
 if __name__ == "__main__":

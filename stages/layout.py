@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sceneexpander.selection import CORRECTED, METHODS, OPTIMISABLE, OPTIMISED, OURS, RIVALS, SPLATTED
-
-__all__ = ["CORRECTED", "METHODS", "OPTIMISABLE", "OPTIMISED", "OURS", "RIVALS", "SPLATTED"]
+from sceneexpander.catalogue import MAIN
 
 SCENES = Path("scenes")
 OUTPUTS = Path("outputs")
@@ -56,7 +54,7 @@ def round_folder(scene: str, number: int) -> Path:
 
 def state(scene: str, number: int) -> Path:
     """The `ExpansionState` after a round."""
-    return round_folder(scene, number) / "sceneexpander"
+    return round_folder(scene, number) / MAIN
 
 
 def reconstruction(scene: str, number: int, method: str) -> Path:

@@ -7,7 +7,9 @@ from pathlib import Path
 
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable, unavailable_in
+from sceneexpander.catalogue import method_named
 from sceneexpander.config.files import read_sections
+from sceneexpander.errors import UserError
 from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.progress import progress_bar
 from stages import layout
@@ -24,8 +26,8 @@ class Sections:
     optimise: OptimiseConfig
 
 
-def optimise_from(cell: Cell, start: str, *, stage_name: str) -> None:
-    """Make the cell's method from the method ``start``, or write down why it cannot be."""
+def optimise_start(cell: Cell, *, stage_name: str) -> None:
+    """Make the cell's method from the one that it starts from, or write down why it cannot be."""
     # Not at the top: most runs ask for no optimisation, and torch takes seconds to import.
     from sceneexpander.artifacts.inserted import InsertedView
     from sceneexpander.artifacts.reconstruction import Reconstruction
@@ -35,7 +37,10 @@ def optimise_from(cell: Cell, start: str, *, stage_name: str) -> None:
 
     sections = read_sections(layout.config(cell.scene), Sections)
     use_machine(sections.threads)
-    made = layout.reconstruction(cell.scene, cell.round, start)
+    method = method_named(cell.method)
+    if method.starts_from is None:
+        raise UserError(f"{cell.method!r} optimises no other method's result", where=stage_name)
+    made = layout.reconstruction(cell.scene, cell.round, method.starts_from)
     target = layout.reconstruction(cell.scene, cell.round, cell.method).parent
     lacking = unavailable_in(made)
     if lacking is not None:
@@ -85,9 +90,9 @@ def _write_reason(reason: Unavailable, target: Path) -> None:
 
 @stage("scene", "round", "previous", "method")
 def main(cell: Cell) -> None:
-    """The method's name says what it starts from."""
+    """The catalogue says what the method starts from."""
     if not left_out(cell):
-        optimise_from(cell, cell.method.removesuffix("_optimised"), stage_name="optimise")
+        optimise_start(cell, stage_name="optimise")
 
 
 if __name__ == "__main__":

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from sceneexpander.artifacts.metrics import MetricsRow, Row, load_row
 from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
-from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.table import comparison_table, scene_table
 from sceneexpander.report import write_page
+from sceneexpander.selection import read_selection
 from stages import layout
 from stages.runner import Cell, stage
 
@@ -25,26 +24,27 @@ def _digits(value: float) -> float:
 @stage()
 def main(_: Cell) -> None:
     """Page, tables, numbers; scenes, rounds and methods as params.yaml lists them."""
-    selected: dict[str, Any] = read_yaml(Path("params.yaml"))
+    selected = read_selection(Path())
     rows: list[Row] = []
-    numbers: dict[str, Any] = {}
-    for scene in selected["scenes"]:
-        for item in selected["rounds"]:
-            for method in selected["methods"]:
-                row = load_row(layout.PAGES / scene / f"round_{item['k']}" / method / "metrics.json")
+    numbers: dict[str, dict[str, dict[str, dict[str, float | str]]]] = {}
+    for scene in selected.scenes:
+        for number in range(1, selected.rounds + 1):
+            for method in selected.methods:
+                row = load_row(layout.PAGES / scene / f"round_{number}" / method / "metrics.json")
                 rows.append(row)
-                known: dict[str, Any] = (
+                known: dict[str, float | str] = (
                     {name: _digits(value) for name, value in row.numbers().items()}
                     if isinstance(row, MetricsRow)
                     else {"unavailable": row.reason}
                 )
-                numbers.setdefault(scene, {}).setdefault(f"round_{item['k']}", {})[method] = known
+                numbers.setdefault(scene, {}).setdefault(f"round_{number}", {})[method] = known
     if not rows:
         raise UserError("selects nothing to report", where="params.yaml", fix="name scenes, rounds and methods")
     with directory_being_written(layout.REPORT) as folder:
-        write_page([layout.PAGES / scene for scene in selected["scenes"]], folder)
-        write_bytes_atomic(folder / "comparison.md", comparison_table(rows).markdown().encode())
-        write_bytes_atomic(folder / "scenes.csv", scene_table(rows).csv().encode())
+        write_page([layout.PAGES / scene for scene in selected.scenes], folder)
+        for name, table in (("comparison", comparison_table(rows)), ("scenes", scene_table(rows))):
+            for ending, text in (("md", table.markdown()), ("csv", table.csv()), ("tex", table.latex())):
+                write_bytes_atomic(folder / f"{name}.{ending}", text.encode())
     write_json_atomic(RESULTS, numbers)
 
 

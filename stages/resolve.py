@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sceneexpander.catalogue.methods import known_methods
 from sceneexpander.config.compose import compose, scene_option
 from sceneexpander.config.files import write_yaml
 from sceneexpander.config.overrides import written_out
@@ -75,7 +76,8 @@ def main(cell: Cell) -> None:
     for kind, files in named_files(values, rounds).items():
         link_files(files, layout.given(cell.scene, kind))
     write_yaml(
-        layout.selection(cell.scene), {name: name in methods for name in layout.METHODS if name not in layout.OURS}
+        layout.selection(cell.scene),
+        {method.name: method.name in methods for method in known_methods() if not method.always_made},
     )
 
 

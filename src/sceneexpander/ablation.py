@@ -206,7 +206,7 @@ def _measured(
         done += 1
         print(
             f"{title} [{done}/{len(plan)}] {cell.scene} {cell.grade or '-'} {cell.row} seed {cell.seed}: "
-            f"{cell.numbers.psnr_db:.2f} dB ({cell.seconds:.0f} s)",
+            f"{cell.numbers.values['psnr_captured_db']:.2f} dB ({cell.seconds:.0f} s)",
             file=sys.stderr,
             flush=True,
         )

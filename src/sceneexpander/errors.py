@@ -17,6 +17,7 @@ Result = TypeVar("Result")
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+EXIT_CLOSED_PIPE = 141  # what a shell says of a program that SIGPIPE ended
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _FULL_TEXTS = (
     "no space left on device",
@@ -133,6 +134,10 @@ def entry_point(main: Callable[..., Result]) -> Callable[..., Result]:
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
             raise SystemExit(EXIT_INTERRUPTED) from None
+        except BrokenPipeError:
+            # Whoever read the output has had enough (`| head`). What is still buffered has nowhere to go.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise SystemExit(EXIT_CLOSED_PIPE) from None
         except Exception as error:
             full = disk_full(error)
             if full is None:

@@ -33,13 +33,15 @@ from sceneexpander.generation import Forecast, backend_of
 from sceneexpander.ingest import IngestConfig, make_round, read_picture, safe_name, scene_files
 from sceneexpander.ingest.sources import read_capture
 from sceneexpander.ingest.sources.posed import write_posed_photos
+from sceneexpander.pipeline.disk import remove_tree
+from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.plainfiles import require_plain_file
 from sceneexpander.preflight import check_scene
 from sceneexpander.processes import ended_by_signals
 from sceneexpander.project import find_project
 from sceneexpander.report.cameras import camera_lines
 from sceneexpander.selection import Selection, check_name, read_selection
-from sceneexpander.workspace import make_workspace, merged_overrides, remove_tree, reproduce, run_lock
+from sceneexpander.workspace import make_workspace, merged_overrides, reproduce
 
 _NO_PICTURE = "give one --inserted PICTURE for each round, or have them made: --generator reproject, openai, ..."
 SCENE_FILE = "scene.yaml"

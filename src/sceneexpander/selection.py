@@ -13,17 +13,11 @@ from typing import Any
 
 import yaml
 
+from sceneexpander.catalogue import METHODS, method_named
 from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.yamlfile import read_user_yaml
 
 PARAMS = "params.yaml"
-OURS = ("captured", "backbone", "sceneexpander")  # always made: the pipeline itself needs them
-RIVALS = ("omnivggt", "ttt3r")  # networks of others
-SPLATTED = "gaussian_splatting"  # per-scene optimisation, started from the backbone
-OPTIMISABLE = ("sceneexpander", *RIVALS)  # what an optimisation after the fact can start from
-CORRECTED = "corrected"  # ours without a step: what Algorithm 1 is to be compared with
-OPTIMISED = (SPLATTED, *(f"{method}_optimised" for method in OPTIMISABLE))
-METHODS = (*OURS, CORRECTED, *RIVALS, *OPTIMISED)
 RESERVED = frozenset(
     {"pages", "report", "given", "code.json", "environment.json"}
 )  # in outputs/, where every scene has a folder of its name
@@ -47,7 +41,7 @@ class Selection:
     scenes: tuple[str, ...]
     rounds: int
     previous: tuple[int, ...] = ()
-    methods: tuple[str, ...] = OURS
+    methods: tuple[str, ...] = tuple(method.name for method in METHODS if method.always_made)
     overrides: tuple[str, ...] = ()
 
     def to_yaml(self) -> str:
@@ -130,12 +124,11 @@ def _scenes(items: list[Any], where: str) -> tuple[str, ...]:
 def _methods(items: list[Any], where: str) -> tuple[str, ...]:
     """All of them known, and none without what it starts from."""
     methods = _texts(items, where, "sceneexpander")
-    for method in methods:
-        if method not in METHODS:
-            raise UserError(f"unknown {method!r}", where=where, fix=did_you_mean(method, METHODS))
-    for start in RIVALS:
-        if f"{start}_optimised" in methods and start not in methods:
-            raise UserError(f"'{start}_optimised' starts from {start!r}", where=where, fix=f"list {start} too")
+    for method in [method_named(name, where=where) for name in methods]:
+        start = None if method.starts_from is None else method_named(method.starts_from)
+        if start is not None and not start.always_made and start.name not in methods:
+            problem, fix = f"{method.name!r} starts from {start.name!r}", f"list {start.name} too"
+            raise UserError(problem, where=where, fix=fix)
     return _distinct(methods, where)
 
 

@@ -111,16 +111,9 @@ def is_under_version_control(project: Path) -> bool:
 
     A downloaded archive is in none, and git refuses one that belongs to somebody else.
     """
-    from dvc.exceptions import DvcException
-    from dvc.scm import SCM
+    from sceneexpander.pipeline.dvc_adapter import can_use_repository
 
-    if not any((folder / ".git").exists() for folder in (project, *project.parents)):
-        return False
-    try:
-        SCM(str(project)).close()
-    except (DvcException, OSError, ValueError):
-        return False
-    return True
+    return any((folder / ".git").exists() for folder in (project, *project.parents)) and can_use_repository(project)
 
 
 def settle_project(project: Path) -> None:

@@ -7,25 +7,21 @@ runs under a lock named by what determines its result, so a stage that two of th
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import glob
 import hashlib
-import json
 import os
 import shutil
-import stat
 import sys
-import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.config.overrides import key_of, written_out
 from sceneexpander.errors import UserError, interruptible, printable
 from sceneexpander.packages import LOCKS
+from sceneexpander.pipeline.disk import make_writable, remove_tree, require_room
+from sceneexpander.pipeline.locks import RunLock, file_lock
 from sceneexpander.processes import ended_by_signals, kept
 from sceneexpander.project import SWEEP_ENV, find_project
 from sceneexpander.selection import PARAMS, Selection
@@ -36,7 +32,6 @@ COPIED_FOLDERS = ("conf", "src", "stages")
 COPIED_FILES = ("dvc.yaml", ".dvcignore", "pyproject.toml", *LOCKS, ".dvc/config")
 ERROR_FILE = "error.txt"
 _NOT_COPIED = shutil.ignore_patterns("__pycache__", "*.pyc", "*.egg-info", ".*.part")
-_LITTLE_BYTES = 1 << 20  # a disk with less than that is full
 
 
 def merged_overrides(base: Sequence[str], more: Sequence[str], *, project: Path) -> tuple[str, ...]:
@@ -108,102 +103,11 @@ def _replace_folder(source: Path, target: Path, *, move: bool = False) -> None:
             source.rename(scratch)
         else:
             shutil.copytree(source, scratch, ignore=_NOT_COPIED)
-        _make_writable(scratch)
+        make_writable(scratch)
         remove_tree(target)
         scratch.rename(target)
     finally:
         remove_tree(scratch)
-
-
-def _make_writable(folder: Path) -> None:
-    for path in (folder, *folder.rglob("*")):
-        if not path.is_symlink():
-            needed = stat.S_IRWXU if path.is_dir() else stat.S_IRUSR | stat.S_IWUSR
-            if path.stat().st_mode & needed != needed:
-                path.chmod(path.stat().st_mode | needed)
-
-
-def remove_tree(folder: Path) -> None:
-    """Delete a folder that may not exist, whatever its permissions say. Raises `OSError` if it cannot be deleted."""
-    if folder.is_symlink() or folder.is_file():
-        folder.unlink()
-    elif folder.exists():
-        _make_writable(folder)
-        shutil.rmtree(folder)
-
-
-@dataclass(frozen=True, slots=True)
-class RunLock:
-    """A folder that this process alone works on. ``descriptor`` keeps it so, in child processes too."""
-
-    descriptor: int
-
-    def note(self, *processes: int) -> None:
-        """Write down which processes are at work, for the message that others get."""
-        text = json.dumps({"processes": processes, "since": time.strftime("%Y-%m-%d %H:%M:%S")})
-        os.ftruncate(self.descriptor, 0)
-        os.pwrite(self.descriptor, text.encode(), 0)
-
-
-@contextlib.contextmanager
-def run_lock(folder: Path, *, what: Path | None = None) -> Iterator[RunLock]:
-    """Work on ``folder`` alone, until the block ends and the last child that the descriptor was handed to is gone.
-
-    The lock is a file beside the folder, so nothing that happens inside breaks it; the kernel releases it if the process dies.
-    ``what`` is what the error names instead of the folder.
-
-    Raises:
-        UserError: somebody else is at work there.
-    """
-    path = folder.with_name(f".{folder.name}.lock")
-    descriptor = _locked(path, folder if what is None else what, named=what is None)
-    try:
-        lock = RunLock(descriptor)
-        lock.note(os.getpid())
-        yield lock
-    finally:
-        if not folder.exists():  # nothing came of it: not even a lock stays
-            path.unlink(missing_ok=True)
-            with contextlib.suppress(OSError):
-                path.parent.rmdir()
-        os.close(descriptor)
-
-
-def _locked(path: Path, what: Path, *, named: bool) -> int:
-    """An open descriptor of the lock file, which is locked. ``named``: what it guards has a name that can be chosen."""
-    while True:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
-                return descriptor
-        except BlockingIOError:
-            line = f"is being worked on by {_at_work(descriptor)}"
-            os.close(descriptor)
-            fix = "wait for it, end it, or choose another --name" if named else "wait for it or end it"
-            raise UserError(line, where=what, fix=fix) from None
-        os.close(descriptor)  # another process has taken the file away in between
-
-
-def _at_work(descriptor: int) -> str:
-    try:
-        noted = json.loads(os.pread(descriptor, 4096, 0))
-        processes = [int(process) for process in noted["processes"]]
-        alive = next((process for process in processes if _is_alive(process)), processes[0])
-        return f"process {alive} since {noted['since']}"
-    except (ValueError, KeyError, TypeError, IndexError):
-        return "another process"  # it has not written yet who it is
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
 
 
 def workspace_environment(folder: Path, project: Path) -> dict[str, str]:
@@ -257,49 +161,19 @@ def _raise_for(code: int, folder: Path) -> None:
     raise RuntimeError(f"the pipeline failed in {folder} (exit code {code}); its last lines say where")
 
 
-def require_room(folder: Path) -> None:
-    """Raise `UserError` if there is next to no room left on the disk of a pipeline folder or of its cache."""
-    project = find_project()
-    for place in (folder, project / ".dvc" / "cache"):
-        if place.exists() and shutil.disk_usage(place).free < _LITTLE_BYTES:
-            fix = "make room and start the same command again, it goes on with what is missing"
-            raise UserError("No space left on device", where=place, fix=fix)
-
-
-@contextlib.contextmanager
-def file_lock(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock; the kernel releases it if the process dies."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            fcntl.flock(file, fcntl.LOCK_UN)
-
-
 def run_stages(folder: Path, locks: Path) -> None:
-    """Run every stage of a workspace in order, each under a lock named by what determines its result.
+    """Run every stage of a workspace, which is the current folder, in order, each under a lock named by what determines its result."""
+    from sceneexpander.pipeline import dvc_adapter
+    from sceneexpander.pipeline.recording import ask_for_recording
 
-    Uses two private functions of DVC for that name; the version is pinned and a test checks that they are there.
-    """
-    import networkx
-    from dvc.repo import Repo
-    from dvc.stage.cache import _can_hash, _get_stage_hash
-
-    from sceneexpander.pipeline import ask_for_recording, take_any_path
-
-    take_any_path()
     ask_for_recording()
-    addresses = [stage.addressing for stage in reversed(list(networkx.topological_sort(Repo(folder).index.graph)))]
-    for address in addresses:
-        stage = Repo(folder).stage.collect(address)[0]
-        stage.save_deps()  # everything before it has run, so its dependencies exist
-        identity = _get_stage_hash(stage) if _can_hash(stage) else f"{folder}:{address}"
-        name = hashlib.sha256(str(identity).encode()).hexdigest()
+    for address in dvc_adapter.ordered_addresses():
+        # Everything before it has run, so its dependencies exist.
+        identity = dvc_adapter.identify_result(address) or f"{folder}:{address}"
+        name = hashlib.sha256(identity.encode()).hexdigest()
         # A second workspace waits here, then finds the result in the cache.
         with file_lock(locks / name):
-            Repo(folder).reproduce(targets=[address], single_item=True)
+            dvc_adapter.reproduce_stage(address)
 
 
 def main() -> None:

@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 
 from sceneexpander import packages
+from sceneexpander.catalogue import METHODS, Kind
+from sceneexpander.catalogue.methods import methods_of
 from sceneexpander.environment import Environment
 from sceneexpander.errors import UserError
 from sceneexpander.fingerprint import SourceTree
@@ -73,11 +75,11 @@ class Tiny:
             (folder / path).write_text(text)
         self.write(
             layout.config(SCENE),
-            dict.fromkeys(SECTIONS, 1) | {"evaluate": 1, "rivals": dict.fromkeys(layout.RIVALS, 1)},
+            dict.fromkeys(SECTIONS, 1) | {"evaluate": 1, "rivals": dict.fromkeys(methods_of(Kind.RIVAL), 1)},
         )
-        self.write(layout.selection(SCENE), {name: True for name in layout.METHODS if name not in layout.OURS})
+        self.write(layout.selection(SCENE), {method.name: True for method in METHODS if not method.always_made})
         self.write(layout.CODE, hashes(TREE, HERE))
-        for kind in ("generator", "choice", "model", *layout.RIVALS):
+        for kind in ("generator", "choice", "model", *methods_of(Kind.RIVAL)):
             link_files({}, folder / layout.given(SCENE, kind))
         link_files({"round_1": folder / "away/picture.png"}, folder / layout.given(SCENE, "generator"))
         link_files({"round_1": folder / "away/chosen.png"}, folder / layout.given(SCENE, "choice"))

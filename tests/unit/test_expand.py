@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,14 @@ from PIL import Image
 
 from sceneexpander import expand as command
 from sceneexpander import preflight
+from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
+from sceneexpander.artifacts.page import BaseModel, ScenePage
 from sceneexpander.errors import UserError, printable
 from sceneexpander.expand import Request, expand, run_name, stage_scene
 from sceneexpander.generation import Forecast
+from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.preflight import CheckedScene
 from sceneexpander.selection import read_selection
-from sceneexpander.workspace import run_lock
 from tests.unit.ingest.test_survey import texture
 
 ROOT = Path(__file__).parents[2]
@@ -110,7 +113,7 @@ def test_names_of_the_pipelines_own_are_refused(name: str, project: Path, tmp_pa
 @contextmanager
 def somebody_at_work(folder: Path) -> Iterator[int]:
     script = (
-        "import sys, time; from pathlib import Path; from sceneexpander.workspace import run_lock\n"
+        "import sys, time; from pathlib import Path; from sceneexpander.pipeline.locks import run_lock\n"
         f"with run_lock(Path({str(folder)!r})): print('at work', flush=True); time.sleep(60)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -164,7 +167,7 @@ def test_a_killed_start_leaves_no_child_and_no_lock(tmp_path: Path) -> None:
     script = f"""
 from pathlib import Path
 from sceneexpander.processes import kept
-from sceneexpander.workspace import run_lock
+from sceneexpander.pipeline.locks import run_lock
 with run_lock(Path({str(folder)!r})) as lock:
     with kept(["sleep", "60"], cwd=Path({str(tmp_path)!r}), held=(lock.descriptor,)) as process:
         print(process.pid, flush=True)
@@ -269,10 +272,21 @@ def test_the_last_lines_say_what_became_of_the_photos(
     name: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def ran(folder: Path, **_: object) -> None:
-        cameras = {"summary": f"2 of 3 photos used: {name} left out (its matches agree with no camera)"}
-        page = folder / "outputs" / "pages" / "photos" / "page.json"
-        page.parent.mkdir(parents=True)
-        page.write_text(json.dumps({"cameras": cameras, "rounds": [{"number": 1, "cameras": None}]}))
+        used = ViewCamera(
+            view_id="a", name="a.jpg", generated=False, posed=True, rough=False, reason="", warnings=(), focal_ratio=0.8,
+            focal_source="exif", distortion=(0.0, 0.0), inliers=9, error_px=None,
+        )  # fmt: skip
+        lost = replace(used, view_id="c", name=name, posed=False, reason="its matches agree with no camera")
+        ScenePage(
+            scene="photos",
+            settings={},
+            overrides=(),
+            model=BaseModel(model="mini", weights_sha256="0", licence="free"),
+            captured=(),
+            cameras=CameraReport(views=(used, replace(used, view_id="b"), lost), notes=()),
+            statistics={},
+            rounds=(),
+        ).save(folder / "outputs" / "pages" / "photos")
 
     monkeypatch.setattr(command, "reproduce", ran)
     monkeypatch.setattr(command, "find_project", lambda: project)

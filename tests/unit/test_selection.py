@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from sceneexpander.catalogue import METHODS
 from sceneexpander.errors import UserError
-from sceneexpander.selection import METHODS, RESERVED, Selection, check_name, read_selection
+from sceneexpander.selection import RESERVED, Selection, check_name, read_selection
 from stages import layout
 
 ROOT = Path(__file__).parents[2]
@@ -177,6 +178,6 @@ def test_plain_names_are_taken(name: str) -> None:
 
 
 def test_a_selection_of_all_methods_is_valid(tmp_path: Path) -> None:
-    selection = Selection(scenes=("a",), rounds=1, methods=METHODS)
+    selection = Selection(scenes=("a",), rounds=1, methods=tuple(method.name for method in METHODS))
     (tmp_path / "params.yaml").write_text(selection.to_yaml())
     assert read_selection(tmp_path) == selection

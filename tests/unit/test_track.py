@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from sceneexpander.errors import UserError
-from sceneexpander.pipeline import RECORDED, ask_for_recording
+from sceneexpander.pipeline.recording import RECORDED, ask_for_recording
 from sceneexpander.tracking import TrackingConfig
 from stages import track
 

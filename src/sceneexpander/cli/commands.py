@@ -22,10 +22,12 @@ class Command:
 
 COMMANDS = (
     Command("expand", "sceneexpander.expand", "expand the scene of a folder of photos by a picture and a sentence"),
+    Command("run", "sceneexpander.pipeline.plain", "bring the project's pipeline up to date without DVC"),
     Command("sweep", "sceneexpander.sweep", "run the pipeline for many combinations of settings"),
     Command("ablation", "sceneexpander.ablation", "measure what each part of the method does, against known truth"),
     Command("plan", "sceneexpander.plan", "tell memory and operations in advance, without a GPU or weights"),
     Command("view", "sceneexpander.viewer.__main__", "walk through a reconstructed scene in the browser"),
+    Command("export", "sceneexpander.export", "write a finished scene as PLY, SPZ, GLB, mesh, COLMAP, nerfstudio, ..."),
     Command("ui", "sceneexpander.ui", "open all recorded runs in the browser, running ones live"),
     Command("follow", "sceneexpander.follow", "mirror running adaptations into MLflow without the browser"),
     Command(

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
+from sceneexpander.catalogue import METHODS
 from sceneexpander.config.parse import ConfigError
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.typed import members_of
@@ -26,8 +27,7 @@ PATH_KEYS = frozenset(
         "generator.file",
         "generator.workflow",
         "choose.candidate",
-        "rivals.omnivggt.weights",
-        "rivals.ttt3r.weights",
+        *(f"rivals.{method.name}.weights" for method in METHODS if method.needs_weights),
     }
 )
 MAX_OVERRIDE = 20_000  # characters: key frames are the longest

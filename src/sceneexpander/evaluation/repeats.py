@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
-from sceneexpander.artifacts.metrics import PARTS, MetricsRow
+from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.catalogue.metrics import COUNTS
 
 
 def over_repeats(rows: Sequence[MetricsRow]) -> MetricsRow:
-    """The row of a method that was run once per given row. A number that one run lacks is left out.
+    """The row of a method that was run once per given row. A number that one run lacks is left out; counts are the first run's.
 
     Raises:
         ValueError: there are no rows, or they do not belong together.
@@ -20,21 +21,13 @@ def over_repeats(rows: Sequence[MetricsRow]) -> MetricsRow:
     first = rows[0]
     if len(rows) == 1:
         return first
-    names = [f.name for f in fields(MetricsRow) if f.type in ("float", "float | None")]
-    parts = {part: getattr(first, part) for part in PARTS if getattr(first, part) is not None}
-    nested = {part: [f.name for f in fields(held)] for part, held in parts.items()}
-    of_parts = [f"{part}.{name}" for part, inside in nested.items() for name in inside]
-    found = {name: [row.value(name) for row in rows] for name in (*names, *of_parts)}
-    known = {name: [v for v in values if v is not None] for name, values in found.items() if None not in values}
-    means = {name: statistics.fmean(values) for name, values in known.items()}
-    merged = {
-        part: replace(held, **{name: means.get(f"{part}.{name}") for name in nested[part]})
-        for part, held in parts.items()
-    }
+    counts = {metric.name for metric in COUNTS}
+    names = [name for name in first.values if name not in counts and all(name in row.values for row in rows)]
+    runs = {name: [row.values[name] for row in rows] for name in names}
+    means = {name: statistics.fmean(values) for name, values in runs.items()}
     return replace(
         first,
         repeats=len(rows),
-        spread={name: statistics.stdev(values) for name, values in known.items()},
-        **merged,
-        **{name: means.get(name) for name in names},  # type: ignore[arg-type]
+        values={name: value for name, value in first.values.items() if name in counts} | means,
+        spread={name: statistics.stdev(values) for name, values in runs.items()},
     )

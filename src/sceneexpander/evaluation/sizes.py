@@ -6,15 +6,18 @@ rasteriser's blur there, and leave gaps as soon as the same pixel becomes four. 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from sceneexpander.artifacts.metrics import SIZES, SizeMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import WINDOW, psnr, ssim
+from sceneexpander.evaluation.measure import Measure, SeenView, Values
 from sceneexpander.evaluation.perceptual import st_lpips
 from sceneexpander.geometry.camera import resize_intrinsics
 from sceneexpander.splatting import render
@@ -23,6 +26,29 @@ OPEN_ALPHA = 0.9  # below it one looks through a surface
 PSNR_CAP_DB = 100.0
 _LEAST_SIDE_PX = 28  # smaller pictures vanish inside the network of ST-LPIPS
 _TIMES = {"half": 0.5, "double": 2.0, "quadruple": 4.0}
+# Of each size the end of its metrics' names.
+_CAPTURED = {
+    "own": "at_photo_size",
+    "half": "captured_half_size",
+    "double": "captured_double_size",
+    "quadruple": "captured_quadruple_size",
+}
+_INSERTED = {"own": "at_picture_size"}
+SIZES = tuple(_CAPTURED)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SizeMetrics:
+    """What a camera sees of the reconstruction when its picture is drawn at another size than the stored one, against the photo.
+
+    ``open_share`` is the share of pixels that show something in the photo and where the reconstruction's alpha is below 0.9: one looks
+    through it. The others compare with the photo brought to that size; None where it has not that many pixels.
+    """
+
+    open_share: float
+    psnr_db: float | None = None
+    ssim: float | None = None
+    st_lpips: float | None = None
 
 
 @torch.no_grad()
@@ -91,3 +117,28 @@ def _at_size(
         ssim=ssim(picture, wanted, shown),
         st_lpips=perceptual,
     )
+
+
+class AtOtherSizes(Measure):
+    """Captured views at the photo's own size and at multiples of the stored one, the inserted view at its picture's own."""
+
+    metrics = metrics_named(
+        *(
+            name.format(where)
+            for where in (*_CAPTURED.values(), *_INSERTED.values())
+            for name in ("psnr_{}_db", "ssim_{}", "st_lpips_{}", "seen_through_{}")
+        )
+    )
+
+    def of_view(self, view: SeenView) -> Values:
+        """The numbers of every size that is large enough."""
+        names = _INSERTED if view.generated else _CAPTURED
+        found = at_sizes(view.reconstruction, view.index, view.photo, view.valid, view.config, tuple(names))
+        values: dict[str, float | None] = {}
+        for size, measured in found.items():
+            where = names[size]
+            values[f"psnr_{where}_db"] = measured.psnr_db
+            values[f"ssim_{where}"] = measured.ssim
+            values[f"st_lpips_{where}"] = measured.st_lpips
+            values[f"seen_through_{where}"] = measured.open_share
+        return values

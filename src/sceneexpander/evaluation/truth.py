@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from sceneexpander.artifacts.metrics import TruthMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError, check_inside, read_json, read_typed, sha256_of_file
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
@@ -70,6 +69,25 @@ class SceneTruth:
     def of(self, record: ViewRecord) -> ViewTruth | None:
         """Truth of a view, if known."""
         return self.views.get(record.sha256)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruthMetrics:
+    """Against known truth. Angles in degrees, from relative poses of view pairs; ATE in the truth's unit; depths after one common scale.
+
+    The scale is the median ratio of true to estimated depth over all captured views; the inserted view's new region
+    uses that same scale. None where too little is known.
+    """
+
+    camera_rotation_deg: float | None = None
+    camera_direction_deg: float | None = None
+    camera_ate: float | None = None
+    depth_abs_rel: float | None = None
+    depth_within_125: float | None = None
+    inserted_rotation_deg: float | None = None
+    inserted_direction_deg: float | None = None
+    new_region_abs_rel: float | None = None
+    new_region_within_125: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,43 +2,34 @@
 
 Everything is rendered at the cameras that the reconstruction itself gives its views, on black: each method has its own gauge, and
 true cameras are not known in general. What a high score here does not say: that the geometry is right. A reconstruction whose views
-each paint only their own pixels scores well; the ``others_`` columns of `ViewMetrics` are there to notice that.
+each paint only their own pixels scores well; the numbers "from others" are there to notice that.
 
 Pixels of a picture that do not show the place (`ViewSet.valid`) count in none of the numbers; for ST-LPIPS they are black on both sides.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.artifacts.metrics import SIZES, ViewMetrics
+from sceneexpander.artifacts.metrics import ViewMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.catalogue import Views, metric_named
+from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import psnr, ssim
+from sceneexpander.evaluation.measure import Measure, SeenView, Subject, Values, known_values
 from sceneexpander.evaluation.perceptual import st_lpips
-from sceneexpander.evaluation.sizes import PSNR_CAP_DB, at_sizes
+from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import align_views
-from sceneexpander.splatting import Render, render
+from sceneexpander.splatting import render
 
 _FEWEST_PIXELS = 64  # fewer covered pixels say nothing about a picture
-
-
-def preservation(reconstruction: Reconstruction, views: ViewSet, config: EvaluateConfig) -> tuple[ViewMetrics, ...]:
-    """One row per captured view of the reconstruction: rendered there, compared with the captured picture."""
-    return _rows(reconstruction, views, config, generated=False)
-
-
-def insertion_fidelity(
-    reconstruction: Reconstruction, views: ViewSet, config: EvaluateConfig
-) -> tuple[ViewMetrics, ...]:
-    """The same for the generated views, in order; empty if the reconstruction has none."""
-    return _rows(reconstruction, views, config, generated=True)
 
 
 @torch.no_grad()
@@ -55,7 +46,7 @@ def navigation_coverage(
     Coverage gained by an expansion is the difference of the means after and before, on the same frames: see `same_place`.
     """
     shares = [
-        _see(reconstruction.gaussians, pose[None], intrinsics[None], height, width, config).alpha[0]
+        render(reconstruction.gaussians, pose[None], intrinsics[None], height, width).alpha[0]
         for pose, intrinsics in zip(world_from_cam, intrinsics_px, strict=True)
     ]
     return (torch.stack(shares) > config.coverage_alpha).to(torch.float32).mean(dim=(1, 2))
@@ -92,9 +83,19 @@ def same_place(
 
 
 @torch.no_grad()
-def _rows(
-    reconstruction: Reconstruction, views: ViewSet, config: EvaluateConfig, *, generated: bool
+def measure_views(
+    reconstruction: Reconstruction,
+    views: ViewSet,
+    config: EvaluateConfig,
+    measures: Sequence[Measure],
+    *,
+    generated: bool,
 ) -> tuple[ViewMetrics, ...]:
+    """One row per captured (or generated) view of the reconstruction, in order: rendered there and measured.
+
+    Raises:
+        ValueError: a picture is missing or of another size, or a measure mixes up captured and inserted views.
+    """
     if reconstruction.depth.shape[1:] != views.images.shape[2:]:
         raise ValueError(
             f"the reconstruction has {tuple(reconstruction.depth.shape[1:])} pixels, the views {views.height, views.width}"
@@ -106,79 +107,141 @@ def _rows(
             continue
         if view_id not in picture_of:
             raise ValueError(f"no picture of view {view_id!r} was given, only {list(picture_of)}")
-        place = picture_of[view_id]
-        valid = None if views.valid is None else views.valid[place]
-        if valid is not None and int(valid.sum()) < _FEWEST_PIXELS:
-            valid = None
-        sizes = at_sizes(reconstruction, index, views.photo(place), valid, config, ("own",) if generated else SIZES)
-        rows.append(replace(_row(reconstruction, index, views.images[place], valid, config), **sizes))  # type: ignore[arg-type]
+        seen = _seen(reconstruction, index, views, picture_of[view_id], config)
+        values: dict[str, float] = {}
+        for measure in measures:
+            values |= known_values(measure, measure.of_view(seen))
+        kind = Views.INSERTED if generated else Views.CAPTURED
+        for name in values:
+            if metric_named(name).scope.views is not kind:
+                raise ValueError(f"{name!r} is not a metric of {kind} views")
+        rows.append(
+            ViewMetrics(
+                view_id=view_id,
+                generated=generated,
+                posed=bool(reconstruction.posed[index]),
+                values=values,
+            )
+        )
     return tuple(rows)
 
 
-def _row(
-    reconstruction: Reconstruction,
-    index: int,
-    picture: Float[Tensor, "3 height width"],
-    valid: Bool[Tensor, "height width"] | None,
-    config: EvaluateConfig,
-) -> ViewMetrics:
-    gaussians = reconstruction.gaussians
+def _seen(reconstruction: Reconstruction, index: int, views: ViewSet, place: int, config: EvaluateConfig) -> SeenView:
+    picture = views.images[place]
+    valid = None if views.valid is None else views.valid[place]
+    if valid is not None and int(valid.sum()) < _FEWEST_PIXELS:
+        valid = None
     camera = (reconstruction.world_from_cam[index : index + 1], reconstruction.intrinsics_px[index : index + 1])
-    height, width = picture.shape[1:]
-    seen = _see(gaussians, *camera, height, width, config)
-    alpha = seen.alpha[0]
-    counted = torch.ones_like(alpha, dtype=torch.bool) if valid is None else valid
-    covered = (alpha > config.coverage_alpha) & counted
-    depth = reconstruction.depth[index]
-    relative = (seen.depth[0] - depth).abs()[covered] / depth[covered]
-    others_coverage, others_psnr = None, None
-    if config.cross_view and len(reconstruction.view_ids) > 1:
-        others = gaussians.select(gaussians.source_view != index)
-        others_coverage, others_psnr = _seen_by_others(others, camera, picture, counted, config)
-    return ViewMetrics(
-        view_id=reconstruction.view_ids[index],
-        generated=bool(reconstruction.generated[index]),
-        posed=bool(reconstruction.posed[index]),
-        psnr_db=min(psnr(seen.rgb[0], picture, valid), PSNR_CAP_DB),
-        ssim=ssim(seen.rgb[0], picture, valid),
-        coverage=_share(covered, counted),
-        generated_share=float((seen.generated[0] * alpha)[counted].sum() / alpha[counted].sum().clamp(min=1e-12)),
-        depth_disagreement=float(relative.median()) if len(relative) else None,
-        others_coverage=others_coverage,
-        others_psnr_db=others_psnr,
-        st_lpips=st_lpips(seen.rgb[0] * counted, picture * counted) if config.st_lpips else None,
+    return SeenView(
+        reconstruction=reconstruction,
+        index=index,
+        picture=picture,
+        photo=views.photo(place),
+        valid=valid,
+        render=render(reconstruction.gaussians, *camera, *picture.shape[1:]),
+        config=config,
     )
+
+
+class AtStoredSize(Measure):
+    """A view as its own camera shows it, against its picture, at the size that methods are given.
+
+    PSNR is capped (equal images would be infinite). Covered is a pixel with alpha above the threshold. The generated share is the part of
+    alpha that Gaussians of generated views contribute. The disagreement of depth is the median of |rendered - per-view depth| / per-view
+    depth over covered pixels (0 for optimised methods, whose depth is the rendered one).
+    """
+
+    _captured = (
+        "psnr_captured_db",
+        "ssim_captured",
+        "st_lpips_captured",
+        "views_covered",
+        "share_generated_captured",
+        "depth_disagreement",
+    )
+    _inserted = (
+        "psnr_inserted_db",
+        "ssim_inserted",
+        "st_lpips_inserted",
+        "inserted_covered",
+        "share_generated",
+        "inserted_depth_disagreement",
+    )
+    metrics = metrics_named(*_captured, *_inserted)
+
+    def of_view(self, view: SeenView) -> Values:
+        """All of the view's kind."""
+        rgb, alpha = view.render.rgb[0], view.render.alpha[0]
+        counted = _counted(view)
+        covered = (alpha > view.config.coverage_alpha) & counted
+        depth = view.reconstruction.depth[view.index]
+        relative = (view.render.depth[0] - depth).abs()[covered] / depth[covered]
+        generated = view.render.generated[0]
+        values = (
+            min(psnr(rgb, view.picture, view.valid), PSNR_CAP_DB),
+            ssim(rgb, view.picture, view.valid),
+            st_lpips(rgb * counted, view.picture * counted) if view.config.st_lpips else None,
+            _share(covered, counted),
+            float((generated * alpha)[counted].sum() / alpha[counted].sum().clamp(min=1e-12)),
+            float(relative.median()) if len(relative) else None,
+        )
+        return dict(zip(self._inserted if view.generated else self._captured, values, strict=True))
+
+
+class FromOthers(Measure):
+    """A view painted only by Gaussians that came from *other* views, over the pixels that those cover.
+
+    A picture that agrees with its neighbours scores high, doubled contours (ghosting) score low.
+    """
+
+    _captured = ("covered_by_others", "psnr_from_others_db")
+    _inserted = ("inserted_covered_by_others", "psnr_inserted_from_others_db")
+    metrics = metrics_named(*_captured, *_inserted)
+
+    def of_view(self, view: SeenView) -> Values:
+        """Share that is covered, and the PSNR there; nothing for the only view."""
+        whole = view.reconstruction
+        if not view.config.cross_view or len(whole.view_ids) < 2:
+            return {}
+        others = whole.gaussians.select(whole.gaussians.source_view != view.index)
+        found = self._seen_by(others, view)
+        return dict(zip(self._inserted if view.generated else self._captured, found, strict=True))
+
+    def _seen_by(self, others: Gaussians, view: SeenView) -> tuple[float, float | None]:
+        if not len(others):
+            return 0.0, None
+        whole, index, counted = view.reconstruction, view.index, _counted(view)
+        camera = (whole.world_from_cam[index : index + 1], whole.intrinsics_px[index : index + 1])
+        seen = render(others, *camera, *view.picture.shape[1:])
+        covered = (seen.alpha[0] > view.config.coverage_alpha) & counted
+        if int(covered.sum()) < _FEWEST_PIXELS:
+            return _share(covered, counted), None
+        # Divided by alpha: what is compared is the colour that is there, not the black behind it.
+        colour = seen.rgb[0] / seen.alpha[0].clamp(min=1e-6)
+        return _share(covered, counted), min(psnr(colour, view.picture, covered), PSNR_CAP_DB)
+
+
+class TourCoverage(Measure):
+    """How much of the camera path's frames shows something."""
+
+    metrics = metrics_named("tour_covered", "tour_frames")
+
+    def of_scene(self, subject: Subject) -> Values:
+        """Mean share over the frames, and their number."""
+        path = subject.navigation
+        if path is None:
+            return {"tour_frames": 0}
+        frames = navigation_coverage(
+            subject.reconstruction, path.world_from_cam, path.intrinsics_px, path.height, path.width, subject.config
+        )
+        return {"tour_covered": float(frames.double().mean()), "tour_frames": len(frames)}
+
+
+def _counted(view: SeenView) -> Bool[Tensor, "height width"]:
+    if view.valid is not None:
+        return view.valid
+    return torch.ones_like(view.render.alpha[0], dtype=torch.bool)
 
 
 def _share(covered: Bool[Tensor, "height width"], counted: Bool[Tensor, "height width"]) -> float:
     return float(covered[counted].double().mean())
-
-
-def _seen_by_others(
-    others: Gaussians,
-    camera: tuple[Tensor, Tensor],
-    picture: Float[Tensor, "3 height width"],
-    counted: Bool[Tensor, "height width"],
-    config: EvaluateConfig,
-) -> tuple[float, float | None]:
-    if not len(others):
-        return 0.0, None
-    seen = _see(others, *camera, picture.shape[1], picture.shape[2], config)
-    covered = (seen.alpha[0] > config.coverage_alpha) & counted
-    if int(covered.sum()) < _FEWEST_PIXELS:
-        return _share(covered, counted), None
-    # Divided by alpha: what is compared is the colour that is there, not the black behind it.
-    colour = seen.rgb[0] / seen.alpha[0].clamp(min=1e-6)
-    return _share(covered, counted), min(psnr(colour, picture, covered), PSNR_CAP_DB)
-
-
-def _see(
-    gaussians: Gaussians,
-    world_from_cam: Float[Tensor, "1 4 4"],
-    intrinsics_px: Float[Tensor, "1 3 3"],
-    height: int,
-    width: int,
-    config: EvaluateConfig,
-) -> Render:
-    """One view, on black."""
-    return render(gaussians, world_from_cam, intrinsics_px, height, width)

@@ -9,13 +9,13 @@ from typing import Any
 
 from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed, to_plain, write_json_atomic
+from sceneexpander.catalogue import Metric, Views, metric_named
+from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.expandbench.power import without_power
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
 from sceneexpander.expandbench.scenes import DEVELOPMENT, TEST
 from sceneexpander.expandbench.studies import REFERENCES, STUDIES, Study
 from sceneexpander.expandbench.table import (
-    COLUMNS,
-    Column,
     acceptance_table,
     alone_table,
     components_table,
@@ -26,15 +26,12 @@ from sceneexpander.expandbench.table import (
     scenes_table,
 )
 
-SCHEMA = "ablation/2"
+SCHEMA = "ablation/3"
 DEFAULT, CORRECTED = "none", "corrected"
 READING = "<!-- Above: written by the command. Below: written by hand, without numbers. -->"
-_SHORT = tuple(
-    c
-    for c in COLUMNS
-    if c.name in {"own_psnr_db", "others_psnr_db", "inserted_psnr_db", "new_psnr_db", "between_psnr_db"}
+_SHORT = metrics_named(
+    "psnr_at_photo_size_db", "psnr_from_others_db", "psnr_inserted_db", "psnr_new_region_db", "psnr_half_way_db"
 )
-_COLUMN = {column.name: column for column in COLUMNS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,9 +186,9 @@ def _sections(study: Study, measured: Measured) -> list[str]:
     if len(study.grades) > 2:
         names = [row for row in (CORRECTED, DEFAULT) if row in rows]
         curves = [
-            f"### {column.title}\n\n{curve_table(cells, names, column)}"
+            f"### {column.column}\n\n{curve_table(cells, names, column)}"
             for column in _SHORT
-            if column.name != "inserted_psnr_db"
+            if not column.scope.of_insertion
         ]
         picture = "![captured PSNR against misalignment](ablation.svg)"
         return [*curves, picture, "### Judging candidates before inserting them\n\n" + acceptance_table(cells)]
@@ -200,7 +197,7 @@ def _sections(study: Study, measured: Measured) -> list[str]:
         "### Differences to the baseline\n\n" + paired_table(cells),
         "### Component by component\n\n" + components_table(cells, references_of(rows), powerless(rows), _SHORT),
         "### Scene by scene\n\n" + scenes_table(cells, names),
-        scenes_table(cells, names, _COLUMN["depth_abs_rel"]),
+        scenes_table(cells, names, metric_named("depth_abs_rel")),
         "### Means\n\n" + main_table(cells),
         "### The same weights without the inserted view\n\nWhat a row gains here is no repair.\n\n"
         + alone_table(cells),
@@ -227,22 +224,28 @@ def _in_short(results: Results) -> list[str]:
         ):
             texts = [
                 text
-                for name in ("own_psnr_db", "others_psnr_db", "depth_abs_rel", "new_psnr_db", "between_psnr_db")
-                if (text := _said(cells, row, against, _COLUMN[name])) is not None
-                and not (against == CAPTURED and name in _NEW)
+                for name in (
+                    "psnr_at_photo_size_db",
+                    "psnr_from_others_db",
+                    "depth_abs_rel",
+                    "psnr_new_region_db",
+                    "psnr_half_way_db",
+                )
+                if (text := _said(cells, row, against, metric_named(name))) is not None
+                # The scene before the insertion shows nothing there.
+                and not (against == CAPTURED and metric_named(name).scope.views is Views.HELD_OUT)
             ]
             if texts:
                 lines.append(f"{title} ({where}): {'; '.join(texts)}.")
     return lines or ["Nothing of this is measured yet."]
 
 
-_NEW = {"new_psnr_db", "between_psnr_db"}  # the scene before the insertion shows nothing there
-
-
-def _said(cells: Sequence[CellResult], row: str, against: str, column: Column) -> str | None:
+def _said(cells: Sequence[CellResult], row: str, against: str, column: Metric) -> str | None:
     found = paired(cells, row, column, against=against)
     if found is None:
         return None
-    spread = "" if found.seed_spread is None else f" ± {found.seed_spread:.{column.digits}f}"
-    better = f"better in {found.better} of {found.scenes} scenes, worst {found.lowest:+.{column.digits}f}"
-    return f"{column.title[:-2]} **{found.mean:+.{column.digits}f}{spread}** ({better})"
+    spread = "" if found.seed_spread is None else f" ± {column.bare(found.seed_spread)}"
+    worst = column.bare(found.lowest, sign=True)
+    unit = f" {column.unit}" if column.unit else ""
+    better = f"better in {found.better} of {found.scenes} scenes, worst {worst}"
+    return f"{column.title} **{column.bare(found.mean, sign=True)}{spread}{unit}** ({better})"

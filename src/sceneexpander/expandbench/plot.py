@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from sceneexpander.catalogue import Metric
 from sceneexpander.expandbench.grades import GRADES
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
-from sceneexpander.expandbench.table import COLUMNS, Column, paired, row_names
+from sceneexpander.expandbench.table import COLUMNS, paired, row_names
 
 UNITS = {
     "rotation": "degrees, camera estimated",
@@ -21,7 +22,7 @@ UNITS = {
 }
 
 
-def curve(cells: Sequence[CellResult], row: str, axis: str, column: Column) -> list[tuple[float, float]]:
+def curve(cells: Sequence[CellResult], row: str, axis: str, column: Metric) -> list[tuple[float, float]]:
     """(amount, mean difference to the pre-insertion scene) along an axis, the clean insertion at amount 0 if it was measured."""
     start = "told_clean" if axis.startswith("told_") else "clean"
     points = []
@@ -29,11 +30,11 @@ def curve(cells: Sequence[CellResult], row: str, axis: str, column: Column) -> l
         here = [cell for cell in cells if cell.row == CAPTURED or (cell.row == row and cell.grade == grade.name)]
         found = paired(here, row, column, against=CAPTURED)
         if found is not None:
-            points.append((0.0 if grade.name == start else grade.amount, found.mean))
+            points.append((0.0 if grade.name == start else grade.amount, column.factor * found.mean))
     return points
 
 
-def plot(cells: Sequence[CellResult], path: Path, *, rows: Sequence[str] = (), column: Column = COLUMNS[0]) -> bool:
+def plot(cells: Sequence[CellResult], path: Path, *, rows: Sequence[str] = (), column: Metric = COLUMNS[0]) -> bool:
     """Write an SVG with one panel per axis of which two or more amounts were measured; False if there is none."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -53,7 +54,7 @@ def plot(cells: Sequence[CellResult], path: Path, *, rows: Sequence[str] = (), c
         panel.axhline(0, color="grey", linewidth=0.8)
         panel.set_xlabel(UNITS[axis], fontsize=8)
         panel.tick_params(labelsize=8)
-    panels[0].set_ylabel(f"{column.title.rstrip(' ↑↓')} minus pre-insertion", fontsize=8)
+    panels[0].set_ylabel(f"{column.heading} minus pre-insertion", fontsize=8)
     panels[-1].legend(fontsize=7)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, format="svg", metadata={"Date": None})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sceneexpander.catalogue import metric_named
 from sceneexpander.expandbench.document import powerless, references_of
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan
 from sceneexpander.expandbench.scenes import DEVELOPMENT, TEST
@@ -50,7 +51,7 @@ def report(cells: Sequence[CellResult], plan: Plan, *, model: str, visits: int) 
         "## Control: the adapted weights without the inserted view\n\nThe same weights given the captured views alone. What a "
         "row gains here is not repair of an insertion.\n\n" + alone_table(cells),
         "## Against misalignment\n\n" + curve_table(cells, list(plan.rows)),
-        curve_table(cells, list(plan.rows), next(column for column in COLUMNS if column.name == "new_psnr_db")),
+        curve_table(cells, list(plan.rows), metric_named("psnr_new_region_db")),
         "## Judging candidates before inserting them\n\n" + acceptance_table(cells),
     ]
     return "\n\n".join(part.rstrip() for part in parts) + "\n"

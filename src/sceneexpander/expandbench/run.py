@@ -32,6 +32,7 @@ from sceneexpander.optimisation.config import RefineConfig
 from sceneexpander.reconstruction.views import reconstruct
 
 CAPTURED = "captured"  # the pre-insertion scene
+CELL_SCHEMA = "cell/2"
 PREPARED_KEPT = 4  # codes and configurations whose prepared scenes stay, the last used first
 BASELINE = "baseline"  # the same weights given the inserted view
 _log = logging.getLogger(__name__)
@@ -154,7 +155,14 @@ class _Worker:
 
     def cell(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult | None:
         """The cell's result, kept or new; None if it is not there and nothing is to be run."""
-        identity = {"shared": self.shared, "scene": self.name, "grade": grade, "row": to_plain(config), "seed": seed}
+        identity = {
+            "schema": CELL_SCHEMA,
+            "shared": self.shared,
+            "scene": self.name,
+            "grade": grade,
+            "row": to_plain(config),
+            "seed": seed,
+        }
         if config is None:
             identity["row"] = row
         key = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()

@@ -3,46 +3,28 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sceneexpander.adaptation.acceptance import Acceptance
-from sceneexpander.expandbench.measure import BenchNumbers
+from sceneexpander.catalogue import Metric, Table
+from sceneexpander.catalogue.metrics import DASH, metrics_named
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
 
-Number = Callable[[BenchNumbers], float | None]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Column:
-    """A number of `BenchNumbers` as a column. ``expansion``: without meaning for the captured views alone."""
-
-    name: str
-    title: str
-    digits: int = 2
-    higher: bool = True
-    expansion: bool = False
-
-    def of(self, numbers: BenchNumbers) -> float | None:
-        """The value."""
-        value = getattr(numbers, self.name)
-        return None if value is None else float(value)
-
-
-COLUMNS: tuple[Column, ...] = (
-    Column(name="own_psnr_db", title="PSNR ↑"),
-    Column(name="own_open_share", title="open ↓", digits=3, higher=False),
-    Column(name="psnr_db", title="PSNR, stored size ↑"),
-    Column(name="ssim", title="SSIM ↑", digits=3),
-    Column(name="st_lpips", title="ST-LPIPS ↓", digits=4, higher=False),
-    Column(name="others_psnr_db", title="cross-view PSNR ↑"),
-    Column(name="camera_rotation_deg", title="camera ° ↓", higher=False),
-    Column(name="depth_abs_rel", title="depth AbsRel ↓", digits=4, higher=False),
-    Column(name="inserted_psnr_db", title="insertion PSNR ↑", expansion=True),
-    Column(name="new_psnr_db", title="new-region PSNR ↑"),
-    Column(name="new_coverage", title="new-region drawn ↑", digits=3),
-    Column(name="new_depth_abs_rel", title="new-region AbsRel ↓", digits=3, higher=False),
-    Column(name="between_psnr_db", title="half-way PSNR ↑"),
+COLUMNS = metrics_named(
+    "psnr_at_photo_size_db",
+    "seen_through_at_photo_size",
+    "psnr_captured_db",
+    "ssim_captured",
+    "st_lpips_captured",
+    "psnr_from_others_db",
+    "camera_rotation_deg",
+    "depth_abs_rel",
+    "psnr_inserted_db",
+    "psnr_new_region_db",
+    "new_region_drawn",
+    "new_region_drawn_abs_rel",
+    "psnr_half_way_db",
 )
 
 
@@ -66,15 +48,15 @@ def row_names(cells: Sequence[CellResult]) -> list[str]:
     ]
 
 
-def mean_of(cells: Iterable[CellResult], column: Column, *, alone: bool = False) -> float | None:
+def mean_of(cells: Iterable[CellResult], column: Metric, *, alone: bool = False) -> float | None:
     """Mean over the cells; None as soon as one of them has no value, or there is none."""
     holders = [cell.alone if alone else cell.numbers for cell in cells]
-    values = [None if holder is None else column.of(holder) for holder in holders]
+    values = [None if holder is None else holder.value(column.name) for holder in holders]
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known and len(known) == len(values) else None
 
 
-def seed_spread(cells: Sequence[CellResult], column: Column) -> float | None:
+def seed_spread(cells: Sequence[CellResult], column: Metric) -> float | None:
     """Standard deviation over seeds of the mean over scenes and grades; None for fewer than two seeds."""
     means = [
         mean_of([cell for cell in cells if cell.seed == seed], column) for seed in sorted({cell.seed for cell in cells})
@@ -83,14 +65,14 @@ def seed_spread(cells: Sequence[CellResult], column: Column) -> float | None:
     return statistics.stdev(known) if len(known) > 1 and len(known) == len(means) else None
 
 
-def paired(cells: Sequence[CellResult], row: str, column: Column, *, against: str = BASELINE) -> Paired | None:
+def paired(cells: Sequence[CellResult], row: str, column: Metric, *, against: str = BASELINE) -> Paired | None:
     """A row against another; None if they share no scene, grade and seed with a value. `CAPTURED` is the same for every grade."""
-    base = {_pair(c, against): column.of(c.numbers) for c in cells if c.row == against}
+    base = {_pair(c, against): c.numbers.value(column.name) for c in cells if c.row == against}
     own = [c for c in cells if c.row == row]
     differences: dict[str, list[float]] = {}
     by_seed: dict[int, list[float]] = {}
     for cell in own:
-        value, reference = column.of(cell.numbers), base.get(_pair(cell, against))
+        value, reference = cell.numbers.value(column.name), base.get(_pair(cell, against))
         if value is None or reference is None:
             continue
         differences.setdefault(cell.scene, []).append(value - reference)
@@ -102,9 +84,9 @@ def paired(cells: Sequence[CellResult], row: str, column: Column, *, against: st
     return Paired(
         row=row,
         mean=sum(means) / len(means),
-        lowest=min(means) if column.higher else max(means),
+        lowest=min(means) if column.better == "higher" else max(means),
         seed_spread=statistics.stdev(seeds) if len(seeds) > 1 else None,
-        better=sum((value > 0) == column.higher and value != 0 for value in means),
+        better=sum((value > 0) == (column.better == "higher") and value != 0 for value in means),
         scenes=len(means),
     )
 
@@ -113,33 +95,33 @@ def _pair(cell: CellResult, against: str) -> tuple[str, str, int]:
     return cell.scene, "" if against == CAPTURED else cell.grade, cell.seed
 
 
-def main_table(cells: Sequence[CellResult], columns: Sequence[Column] = COLUMNS) -> str:
+def main_table(cells: Sequence[CellResult], columns: Sequence[Metric] = COLUMNS) -> str:
     """One line per row: means over scenes and grades, ± over seeds."""
     lines = []
     for row in row_names(cells):
         own = [cell for cell in cells if cell.row == row]
         texts = []
         for column in columns:
-            value = None if column.expansion and row == CAPTURED else mean_of(own, column)
+            value = None if column.scope.of_insertion and row == CAPTURED else mean_of(own, column)
             spread = seed_spread(own, column)
-            text = "–" if value is None else f"{value:.{column.digits}f}"
-            texts.append(text if spread is None or value is None else f"{text} ± {spread:.{column.digits}f}")
+            text = DASH if value is None else column.bare(value)
+            texts.append(text if spread is None or value is None else f"{text} ± {column.bare(spread)}")
         lines.append([row, str(len(own)), *texts])
-    return _markdown(["row", "cells", *(column.title for column in columns)], lines)
+    return _markdown(["row", "cells", *(column.column for column in columns)], lines)
 
 
-def paired_table(cells: Sequence[CellResult], columns: Sequence[Column] = COLUMNS) -> str:
+def paired_table(cells: Sequence[CellResult], columns: Sequence[Metric] = COLUMNS) -> str:
     """One line per row: mean difference to the baseline, its spread over seeds, the worst scene's, and how many scenes are better."""
     lines = [
         [row, *(_difference(paired(cells, row, column), column) for column in columns)]
         for row in row_names(cells)
         if row not in (CAPTURED, BASELINE)
     ]
-    return _markdown(["row", *(column.title for column in columns)], lines)
+    return _markdown(["row", *(column.column for column in columns)], lines)
 
 
 def components_table(
-    cells: Sequence[CellResult], references: Mapping[str, str], powerless: Mapping[str, str], columns: Sequence[Column]
+    cells: Sequence[CellResult], references: Mapping[str, str], powerless: Mapping[str, str], columns: Sequence[Metric]
 ) -> str:
     """One line per row against the row that lacks one component (or has one more), so that the component's own effect shows.
 
@@ -156,12 +138,12 @@ def components_table(
             continue
         texts = [_difference(item, column) for item, column in zip(found, columns, strict=True)]
         if row in powerless:
-            texts = [powerless[row], *["–"] * (len(columns) - 1)]
+            texts = [powerless[row], *[DASH] * (len(columns) - 1)]
         lines.append([row, reference, *texts])
-    return _markdown(["row", "against", *(column.title for column in columns)], lines)
+    return _markdown(["row", "against", *(column.column for column in columns)], lines)
 
 
-def scenes_table(cells: Sequence[CellResult], rows: Sequence[str], column: Column = COLUMNS[0]) -> str:
+def scenes_table(cells: Sequence[CellResult], rows: Sequence[str], column: Metric = COLUMNS[0]) -> str:
     """Scene by scene: the value before the insertion, what the insertion costs, and each row's difference to the baseline."""
     scenes = list(dict.fromkeys(cell.scene for cell in cells))
     shown = [("before", None, None), ("baseline", BASELINE, CAPTURED), *((row, row, BASELINE) for row in rows)]
@@ -172,20 +154,20 @@ def scenes_table(cells: Sequence[CellResult], rows: Sequence[str], column: Colum
             here = [cell for cell in cells if cell.scene == scene]
             if row is None or against is None:
                 value = mean_of([cell for cell in here if cell.row == CAPTURED], column)
-                texts.append("–" if value is None else f"{value:.{column.digits}f}")
+                texts.append(DASH if value is None else column.bare(value))
             else:
                 found = paired(here, row, column, against=against)
-                texts.append("–" if found is None else f"{found.mean:+.{column.digits}f}")
+                texts.append(DASH if found is None else column.bare(found.mean, sign=True))
         lines.append([title, *texts])
-    return _markdown([column.title, *scenes], lines)
+    return _markdown([column.column, *scenes], lines)
 
 
-def _difference(found: Paired | None, column: Column) -> str:
+def _difference(found: Paired | None, column: Metric) -> str:
     if found is None:
-        return "–"
-    spread = "" if found.seed_spread is None else f" ± {found.seed_spread:.{column.digits}f}"
-    worst = f"worst {found.lowest:+.{column.digits}f}; {found.better}/{found.scenes}"
-    return f"{found.mean:+.{column.digits}f}{spread} ({worst})"
+        return DASH
+    spread = "" if found.seed_spread is None else f" ± {column.bare(found.seed_spread)}"
+    worst = f"worst {column.bare(found.lowest, sign=True)}; {found.better}/{found.scenes}"
+    return f"{column.bare(found.mean, sign=True)}{spread} ({worst})"
 
 
 def alone_table(cells: Sequence[CellResult]) -> str:
@@ -199,15 +181,15 @@ def alone_table(cells: Sequence[CellResult]) -> str:
                 [
                     row,
                     *(
-                        "–" if value is None else f"{value:.{column.digits}f}"
+                        DASH if value is None else column.bare(value)
                         for value, column in zip(values, COLUMNS[:5], strict=True)
                     ),
                 ]
             )
-    return _markdown(["row", *(column.title for column in COLUMNS[:5])], lines)
+    return _markdown(["row", *(column.column for column in COLUMNS[:5])], lines)
 
 
-def curve_table(cells: Sequence[CellResult], rows: Sequence[str], column: Column = COLUMNS[0]) -> str:
+def curve_table(cells: Sequence[CellResult], rows: Sequence[str], column: Metric = COLUMNS[0]) -> str:
     """Per grade: what the insertion costs against the scene before it, and each row's gain over the baseline."""
     lines = []
     before = [cell for cell in cells if cell.row == CAPTURED]
@@ -216,7 +198,7 @@ def curve_table(cells: Sequence[CellResult], rows: Sequence[str], column: Column
         texts = [_difference(paired([*before, *here], BASELINE, column, against=CAPTURED), column)]
         texts += [_difference(paired(here, row, column), column) for row in rows]
         lines.append([grade, *texts])
-    return _markdown(["grade", f"insertion's effect on {column.title}", *(f"{row} − baseline" for row in rows)], lines)
+    return _markdown(["grade", f"insertion's effect on {column.column}", *(f"{row} − baseline" for row in rows)], lines)
 
 
 HARM_DB = 0.5  # loss of captured PSNR by the insertion from which on a candidate should have been refused
@@ -227,14 +209,18 @@ def acceptance_table(cells: Sequence[CellResult]) -> str:
 
     "Tells apart" is the probability that a harmful candidate has the larger value (the smaller for the overlap): 0.5 is chance.
     """
-    before = {(cell.scene, cell.seed): cell.numbers.psnr_db for cell in cells if cell.row == CAPTURED}
+    before = {
+        (cell.scene, cell.seed): cell.numbers.values["psnr_captured_db"] for cell in cells if cell.row == CAPTURED
+    }
     candidates: dict[tuple[str, str], Acceptance] = {}
     costs: dict[tuple[str, str], list[float]] = {}
     for cell in cells:
         if cell.row == BASELINE and cell.candidate is not None and (cell.scene, cell.seed) in before:
             # A candidate is judged once, whatever the seed.
             candidates[cell.scene, cell.grade] = cell.candidate
-            costs.setdefault((cell.scene, cell.grade), []).append(before[cell.scene, cell.seed] - cell.numbers.psnr_db)
+            costs.setdefault((cell.scene, cell.grade), []).append(
+                before[cell.scene, cell.seed] - cell.numbers.values["psnr_captured_db"]
+            )
     judged = [(candidate, statistics.fmean(costs[key])) for key, candidate in candidates.items()]
     if not judged:
         return "No candidate was judged.\n"
@@ -244,11 +230,11 @@ def acceptance_table(cells: Sequence[CellResult]) -> str:
         values = [getattr(candidate, name) for candidate, _ in judged]
         known = [(-v if name == "overlap" else v, bad) for v, bad in zip(values, harmful, strict=True) if v is not None]
         told = _separation(known)
-        lines.append([name, str(len(known)), "–" if told is None else f"{told:.2f}"])
-    lines.append(["refused", f"{sum(not c.accepted for c, _ in judged)} of {len(judged)}", "–"])
+        lines.append([name, str(len(known)), DASH if told is None else f"{told:.2f}"])
+    lines.append(["refused", f"{sum(not c.accepted for c, _ in judged)} of {len(judged)}", DASH])
     for accepted, title in ((True, "mean loss of the accepted, dB"), (False, "mean loss of the refused, dB")):
         losses = [harm for candidate, harm in judged if candidate.accepted == accepted]
-        lines.append([title, str(len(losses)), f"{sum(losses) / len(losses):.2f}" if losses else "–"])
+        lines.append([title, str(len(losses)), f"{sum(losses) / len(losses):.2f}" if losses else DASH])
     title = f"tells apart ({sum(harmful)} cost more than {HARM_DB} dB)"
     return _markdown(["measure", "candidates", title], lines)
 
@@ -262,5 +248,4 @@ def _separation(values: Sequence[tuple[float, bool]]) -> float | None:
 
 
 def _markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    rule = [":--"] + ["--:"] * (len(header) - 1)
-    return "\n".join("| " + " | ".join(line) + " |" for line in [header, rule, *lines]) + "\n"
+    return Table(header=tuple(header), lines=tuple(map(tuple, lines))).markdown()

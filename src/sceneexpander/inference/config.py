@@ -42,4 +42,5 @@ class RivalsConfig:
 
     def of(self, method: str) -> RivalConfig:
         """The section of a method."""
-        return {"omnivggt": self.omnivggt, "ttt3r": self.ttt3r}[method]
+        section: RivalConfig = getattr(self, method)
+        return section

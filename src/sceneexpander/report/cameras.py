@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from sceneexpander.artifacts.cameras import CameraReport
-from sceneexpander.artifacts.store import read_json
+from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
+from sceneexpander.artifacts.page import NAME, ScenePage
 
-FACTS = "page.json"
 _FILM_LONG_SIDE_MM = 36.0
 _FOCAL_SOURCES = {
     "known": "as given",
@@ -50,70 +48,58 @@ class CamerasShown:
     complete: bool  # every view was used
 
 
-def gathered_cameras(folder: Path | None) -> dict[str, Any] | None:
-    """A `CameraReport` with its sentences, ready for JSON; None where there is none (models that need no cameras).
+def gathered_cameras(folder: Path | None) -> CameraReport | None:
+    """The report in a folder; None where there is none (models that need no cameras).
 
     Raises:
         ArtifactError: the report is damaged.
     """
-    if folder is None or not folder.is_dir():
-        return None
-    report = CameraReport.load(folder)
-    return {
-        "summary": report.summary(),
-        "problems": list(report.problems()),
-        "posed": report.posed,
-        "views": list(report.views),
-        "notes": list(report.notes),
-    }
+    return None if folder is None or not folder.is_dir() else CameraReport.load(folder)
 
 
-def cameras_shown(facts: Mapping[str, Any] | None, pictures: Mapping[str, str]) -> CamerasShown | None:
-    """Cards from what `gathered_cameras` gave; ``pictures`` are by view."""
-    if facts is None:
+def cameras_shown(report: CameraReport | None, pictures: Mapping[str, str]) -> CamerasShown | None:
+    """Cards of what was found out about the cameras; ``pictures`` are by view."""
+    if report is None:
         return None
-    views: Sequence[Mapping[str, Any]] = facts["views"]
-    lens, count = Counter(_lens(view) for view in views).most_common(1)[0]
-    shared = lens if 2 * count > len(views) > 1 else ""
+    lens, count = Counter(_lens(view) for view in report.views).most_common(1)[0]
+    shared = lens if 2 * count > len(report.views) > 1 else ""
     return CamerasShown(
-        summary=facts["summary"],
+        summary=report.summary(),
         lens=shared,
-        notes=tuple(facts["notes"]),
-        cards=tuple(_card(view, pictures.get(view["view_id"]), shared) for view in views),
-        complete=facts["posed"] == len(views),
+        notes=report.notes,
+        cards=tuple(_card(view, pictures.get(view.view_id), shared) for view in report.views),
+        complete=report.posed == len(report.views),
     )
 
 
-def _card(view: Mapping[str, Any], picture: str | None, shared: str) -> CameraCard:
-    state, label = (
-        ("out", "left out") if not view["posed"] else ("rough", "rough") if view["rough"] else ("used", "used")
-    )
+def _card(view: ViewCamera, picture: str | None, shared: str) -> CameraCard:
+    state, label = ("out", "left out") if not view.posed else ("rough", "rough") if view.rough else ("used", "used")
     return CameraCard(
-        view_id=view["view_id"],
-        name=view["name"],
+        view_id=view.view_id,
+        name=view.name,
         picture=picture,
-        generated=view["generated"],
+        generated=view.generated,
         state=state,
         label=label,
-        doubts=tuple(text for text in (view["reason"], *view["warnings"]) if text),
+        doubts=tuple(text for text in (view.reason, *view.warnings) if text),
         facts=tuple(text for text in ("" if _lens(view) == shared else _lens(view), _evidence(view)) if text),
     )
 
 
-def _lens(view: Mapping[str, Any]) -> str:
-    source = view["focal_source"]
-    words = [f"about {_FILM_LONG_SIDE_MM * view['focal_ratio']:.0f} mm (35 mm equivalent)"]
+def _lens(view: ViewCamera) -> str:
+    source = view.focal_source
+    words = [f"about {_FILM_LONG_SIDE_MM * view.focal_ratio:.0f} mm (35 mm equivalent)"]
     words += [_FOCAL_SOURCES.get(source, source)] if source else []
-    if any(view["distortion"]):
-        k1, k2 = view["distortion"]
+    if any(view.distortion):
+        k1, k2 = view.distortion
         words.append(f"distortion taken out (k1 {k1:+.3f}, k2 {k2:+.3f})")
     return ", ".join(words)
 
 
-def _evidence(view: Mapping[str, Any]) -> str:
-    if not view["posed"] or not view["inliers"]:
+def _evidence(view: ViewCamera) -> str:
+    if not view.posed or not view.inliers:
         return ""
-    return f"{view['inliers']} points" + ("" if view["error_px"] is None else f", {view['error_px']:.1f} px off")
+    return f"{view.inliers} points" + ("" if view.error_px is None else f", {view.error_px:.1f} px off")
 
 
 def camera_lines(outputs: Path) -> list[str]:
@@ -126,9 +112,8 @@ def camera_lines(outputs: Path) -> list[str]:
         ArtifactError: a file of the gathered scene is damaged.
     """
     lines = []
-    for path in sorted((outputs / "pages").glob(f"*/{FACTS}")):
-        facts = read_json(path)
-        places = [(path.parent.name, facts["cameras"])]
-        places += [(f"{path.parent.name}, round {item['number']}", item["cameras"]) for item in facts["rounds"]]
-        lines += [f"{place}: {found['summary']}" for place, found in places if found is not None]
+    for path in sorted((outputs / "pages").glob(f"*/{NAME}")):
+        page, scene = ScenePage.load(path.parent), path.parent.name
+        places = [(scene, page.cameras), *((f"{scene}, round {item.number}", item.cameras) for item in page.rounds)]
+        lines += [f"{place}: {report.summary()}" for place, report in places if report is not None]
     return lines

@@ -6,42 +6,49 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from PIL import Image
 from torch import Tensor
 
+from sceneexpander.artifacts.cameras import CameraReport
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.page import (
+    BaseModel,
+    Judgement,
+    LookPage,
+    LooksPage,
+    MethodPage,
+    MissingMethod,
+    Photo,
+    Refinement,
+    RoundPage,
+    ScenePage,
+    ShownView,
+    StageRun,
+    Steps,
+    Still,
+)
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.source_type import source_type_xmp
-from sceneexpander.artifacts.store import ArtifactError, read_json, write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed, write_bytes_atomic
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet, to_uint8
+from sceneexpander.catalogue import LOOKS, MAIN, STEPS
 from sceneexpander.report.camera_map import camera_map
-from sceneexpander.report.cameras import FACTS, gathered_cameras
+from sceneexpander.report.cameras import gathered_cameras
 from sceneexpander.report.course import verdict
-from sceneexpander.report.words import method_words
+from sceneexpander.report.words import method_label
 from sceneexpander.viewer.packed import PackedSplats
 from sceneexpander.viewer.page import ShownMethod, viewer_page
 
-MAIN_METHOD = "sceneexpander"
 LOOK_PICTURES = ("captured", "inserted", "depth")  # of every look, named with its step
 _PICTURE_SIDE_PX = 720
-_SERIES = (
-    "loss",
-    "inserted",
-    "anchor_camera",
-    "anchor_depth",
-    "anchor_normal",
-    "gen_camera",
-    "gen_depth",
-    "gen_normal",
-    "drift",
-    "gradient_norm",
-)
+_SERIES = ("loss", *(metric.name for metric in STEPS))
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,13 +87,16 @@ class RoundSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneSource:
-    """Artefacts of one scene. ``report`` is what the first reconstruction said about itself, ``cameras`` its `CameraReport` if any."""
+    """Artefacts of one scene. ``report`` is what the first reconstruction said about itself, ``cameras`` its `CameraReport` if any.
+
+    ``settings``: the composed configuration, see `ScenePage`.
+    """
 
     scene: Path
     report: Path
     statistics: Path
     rounds: Sequence[RoundSource]
-    config: Mapping[str, Any]
+    settings: Mapping[str, str]
     overrides: Sequence[str]
     cameras: Path | None = None
 
@@ -98,19 +108,18 @@ def collect_scene(source: SceneSource, folder: Path) -> None:
         ArtifactError: an artefact is missing or damaged.
     """
     scene = Scene.load(source.scene)
-    facts: dict[str, Any] = {
-        "scene": scene.name,
-        "rounds_defined": len(scene.rounds),
-        "config": dict(source.config),
-        "overrides": list(source.overrides),
-        "model": read_json(source.report),
-        "captured": _captured(scene.views, folder),
-        "cameras": gathered_cameras(source.cameras),
-        "statistics": _statistics(source.statistics),
-        "rounds": [_round(item, source, scene, folder) for item in source.rounds],
-    }
+    page = ScenePage(
+        scene=scene.name,
+        settings=source.settings,
+        overrides=tuple(source.overrides),
+        model=read_typed(BaseModel, read_json(source.report), source.report, extra=True),
+        captured=_captured(scene.views, folder),
+        cameras=gathered_cameras(source.cameras),
+        statistics=_statistics(source.statistics),
+        rounds=tuple(_round(item, source, scene, folder) for item in source.rounds),
+    )
     _write_viewers(source, scene, folder)
-    write_json_atomic(folder / FACTS, facts)
+    page.save(folder)
 
 
 def _write_viewers(source: SceneSource, scene: Scene, folder: Path) -> None:
@@ -121,12 +130,12 @@ def _write_viewers(source: SceneSource, scene: Scene, folder: Path) -> None:
         pictures[inserted.view_ids[0]] = inserted.images[0]
         shown = []
         # The page opens with its last method.
-        for method in sorted(item.methods, key=lambda method: method.name == MAIN_METHOD):
+        for method in sorted(item.methods, key=lambda method: method.name == MAIN):
             if unavailable_in(method.splats) is not None:
                 continue
             splats = PackedSplats.load(method.splats)
             fit = MetricsRow.load(method.metrics).fit
-            shown.append(ShownMethod(splats=splats, label=method_words(method.name, splats.model, fit).label))
+            shown.append(ShownMethod(splats=splats, label=method_label(method.name, splats.model, fit)))
         known = {view for method in shown for view in method.splats.cameras.view_ids}
         page = viewer_page(
             scene.name,
@@ -141,24 +150,24 @@ def _viewer_place(number: int) -> str:
     return f"round_{number}/viewer.html"
 
 
-def _captured(views: ViewSet, folder: Path) -> list[dict[str, Any]]:
-    entries = []
+def _captured(views: ViewSet, folder: Path) -> tuple[Photo, ...]:
+    photos = []
     for record, image in zip(views.records, views.detail_images, strict=True):
         picture = f"captured/{record.view_id}.jpg"
         _save_picture(folder / picture, image)
-        entries.append(
-            {
-                "id": record.view_id,
-                "name": record.name,
-                "original": [record.original_width, record.original_height],
-                "sha256": record.sha256,
-                "picture": picture,
-            }
+        photos.append(
+            Photo(
+                view_id=record.view_id,
+                name=record.name,
+                picture=picture,
+                original=(record.original_width, record.original_height),
+                sha256=record.sha256,
+            )
         )
-    return entries
+    return tuple(photos)
 
 
-def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder: Path) -> dict[str, Any]:
+def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder: Path) -> RoundPage:
     inserted = InsertedView.load(source.inserted)
     chosen = inserted.provenance[inserted.chosen]
     base = f"round_{source.number}"
@@ -169,71 +178,78 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
     if sheet.is_file():
         shutil.copyfile(sheet, folder / base / "sheet.png")
     spec = scene.round_spec(source.number)
-    log = read_json(source.log)
     cameras = gathered_cameras(source.cameras)
     looks = _looks(source.log.parent, folder, base)
-    acceptance = _read_if_any(source.log.parent / "acceptance.json")
+    judgement = _read_if_any(Judgement, source.log.parent / "acceptance.json")
     missing = {item.name: lacking for item in source.methods if (lacking := unavailable_in(item.reconstruction))}
     methods = [_method(item, folder, f"{base}/{item.name}") for item in source.methods if item.name not in missing]
-    return {
-        "number": source.number,
-        "prompt": spec.prompt,
-        "motion": spec.motion,
-        "object": spec.new_object,
-        "full_prompt": chosen.prompt,
-        "backend": chosen.backend,
-        "origin": Path(chosen.source).name,
-        "source_type": kind,
-        "ranking": inserted.ranking,
-        "parameters": chosen.parameters,
-        "candidates": len(inserted.provenance),
-        "inserted": f"{base}/inserted.jpg",
-        "inserted_id": inserted.view.view_ids[0],
-        "viewer": _viewer_place(source.number),
-        "sheet": f"{base}/sheet.png" if sheet.is_file() else None,
-        "methods": methods,
-        "unavailable": [
-            {
-                "name": item.name,
-                "model": missing[item.name].model,
-                "reason": missing[item.name].reason,
-                "metrics": _copy(item.metrics, folder, f"{base}/{item.name}/metrics.json"),
-            }
+    return RoundPage(
+        number=source.number,
+        prompt=spec.prompt,
+        motion=spec.motion,
+        new_object=spec.new_object,
+        full_prompt=chosen.prompt,
+        backend=chosen.backend,
+        origin=Path(chosen.source).name,
+        source_type=kind,
+        ranking=inserted.ranking,
+        parameters=chosen.parameters,
+        candidates=len(inserted.provenance),
+        inserted=f"{base}/inserted.jpg",
+        inserted_id=inserted.view.view_ids[0],
+        viewer=_viewer_place(source.number),
+        sheet=f"{base}/sheet.png" if sheet.is_file() else None,
+        methods=tuple(methods),
+        unavailable=tuple(
+            MissingMethod(
+                name=item.name,
+                model=missing[item.name].model,
+                reason=missing[item.name].reason,
+                metrics=_copy(item.metrics, folder, f"{base}/{item.name}/metrics.json"),
+            )
             for item in source.methods
             if item.name in missing
-        ],
-        "series": {name: [record[name] for record in log] for name in _SERIES if log and name in log[0]},
-        "looks": looks,
-        "cameras": cameras,
-        "problems": _problems(source, scene_source, folder, base),
-        "acceptance": acceptance,
-        "statistics": _statistics(source.statistics),
-        "warnings": [
+        ),
+        steps=_steps(read_json(source.log)),
+        looks=looks,
+        cameras=cameras,
+        problems=_problems(source, scene_source, folder, base),
+        judgement=judgement,
+        statistics=_statistics(source.statistics),
+        warnings=(
             *_warnings(methods, chosen.parameters, cameras),
-            *([judged.text] if (judged := verdict(acceptance)) is not None and judged.refused else []),
-            *(looks["warnings"] if looks else []),
-        ],
-    }
+            *([judged.text] if (judged := verdict(judgement)) is not None and judged.refused else []),
+            *(looks.warnings if looks else ()),
+        ),
+    )
+
+
+def _steps(log: Sequence[Mapping[str, Any]]) -> Steps:
+    names = [name for name in _SERIES if log and name in log[0]]
+    return Steps(
+        inserted=tuple(bool(record["inserted"]) for record in log),
+        values={name: tuple(float(record[name]) for record in log) for name in names},
+    )
 
 
 def _problems(source: RoundSource, scene: SceneSource, folder: Path, base: str) -> str | None:
     """Where everything that is not as it should be with the cameras lies, as a text for the tracked runs; None without any."""
     sets = (("the photos alone", scene.cameras), ("with the inserted view", source.cameras))
     found = [(title, cameras) for title, place in sets if (cameras := gathered_cameras(place)) is not None]
-    if not any(cameras["problems"] for _, cameras in found):
+    if not any(cameras.problems() for _, cameras in found):
         return None
     place = f"{base}/cameras.txt"
-    lines = [line for title, cameras in found for line in (f"{title}: {cameras['summary']}", *cameras["problems"], "")]
+    lines = [line for title, cameras in found for line in (f"{title}: {cameras.summary()}", *cameras.problems(), "")]
     write_bytes_atomic(folder / place, "\n".join(lines).encode())
     return place
 
 
-def _looks(source: Path, folder: Path, base: str) -> dict[str, Any] | None:
+def _looks(source: Path, folder: Path, base: str) -> LooksPage | None:
     """What the adaptation saw of itself, with its pictures; None if it never looked."""
-    facts = _read_if_any(source / "looks.json")
+    facts = read_json(source / "looks.json") if (source / "looks.json").is_file() else None
     if facts is None or not facts["looks"]:
         return None
-    entries = []
+    looks = []
     for look in facts["looks"]:
         names = {kind: f"{kind}_{look['step']:04d}.jpg" for kind in LOOK_PICTURES}
         pictures = {
@@ -241,12 +257,13 @@ def _looks(source: Path, folder: Path, base: str) -> dict[str, Any] | None:
             for kind, name in names.items()
             if (source / "looks" / name).is_file()
         }
-        entries.append({**look, "pictures": pictures})
-    sentences = [f"{text[0].upper()}{text[1:]}." for text in facts["warnings"]]
-    return {"identity": facts["identity"], "entries": entries, "warnings": sentences}
+        values = {metric.name: look[metric.name] for metric in LOOKS if metric.name in look}
+        looks.append(LookPage(step=look["step"], values=values, drift=look["drift"], pictures=pictures))
+    sentences = tuple(f"{text[0].upper()}{text[1:]}." for text in facts["warnings"])
+    return LooksPage(identity=facts["identity"], looks=tuple(looks), warnings=sentences)
 
 
-def _method(source: MethodSource, folder: Path, base: str) -> dict[str, Any]:
+def _method(source: MethodSource, folder: Path, base: str) -> MethodPage:
     renders = Renders.load(source.renders)
     reconstruction = Reconstruction.load(source.reconstruction)
     target = folder / base
@@ -254,71 +271,79 @@ def _method(source: MethodSource, folder: Path, base: str) -> dict[str, Any]:
     videos = {
         layer: _copy(source.renders / name, folder, f"{base}/{layer}.mp4") for layer, name in renders.videos.items()
     }
-    stills = [
-        {
-            "frame": index,
-            **{
+    stills = tuple(
+        Still(
+            frame=index,
+            pictures={
                 layer: _copy(source.renders / name, folder, f"{base}/{layer}_{index:04d}{Path(name).suffix}")
                 for layer, name in pictures.items()
             },
-        }
+        )
         for index, pictures in renders.stills
-    ]
+    )
     views = {
         view: _copy(source.renders / name, folder, f"{base}/view_{view}{Path(name).suffix}")
         for view, name in renders.views
     }
-    return {
-        "name": source.name,
-        "model": reconstruction.model,
-        "weights_sha256": reconstruction.weights_sha256,
-        "licence": report["licence"] if (report := _read_if_any(source.report)) is not None else None,
-        "refinement": _read_if_any(source.refinement),
-        "views": [
-            {"id": view, "generated": bool(generated), "posed": bool(posed)}
+    licence = _read_if_any(_Licence, source.report)
+    return MethodPage(
+        name=source.name,
+        model=reconstruction.model,
+        weights_sha256=reconstruction.weights_sha256,
+        licence=None if licence is None else licence.licence,
+        refinement=_read_if_any(Refinement, source.refinement),
+        views=tuple(
+            ShownView(view_id=view, generated=bool(generated), posed=bool(posed))
             for view, generated, posed in zip(
                 reconstruction.view_ids, reconstruction.generated, reconstruction.posed, strict=True
             )
-        ],
-        "videos": videos,
-        "stills": stills,
-        "view_pictures": views,
-        "frames": renders.frames,
-        "fps": renders.fps,
-        "inserted_frame": renders.inserted_frame,
-        "inserted_camera": renders.inserted_camera,
-        "width": renders.width,
-        "height": renders.height,
-        "gaussians": renders.gaussians,
-        "metrics": _copy(source.metrics, folder, f"{base}/metrics.json"),
-        "map": camera_map(reconstruction),
-    }
+        ),
+        videos=videos,
+        stills=stills,
+        view_pictures=views,
+        frames=renders.frames,
+        fps=renders.fps,
+        inserted_frame=renders.inserted_frame,
+        inserted_camera=renders.inserted_camera,
+        width=renders.width,
+        height=renders.height,
+        gaussians=renders.gaussians,
+        metrics=_copy(source.metrics, folder, f"{base}/metrics.json"),
+        map=camera_map(reconstruction),
+    )
 
 
-def _warnings(
-    methods: Sequence[Mapping[str, Any]], parameters: Mapping[str, str], cameras: Mapping[str, Any] | None
-) -> list[str]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Licence:
+    """What a method with weights of its own says about them."""
+
+    licence: str
+
+
+def _warnings(methods: Sequence[MethodPage], parameters: Mapping[str, str], cameras: CameraReport | None) -> list[str]:
     found = []
     # What the cameras' own report says is not repeated for every method.
-    said = {view.view_id for view in cameras["views"] if not view.posed} if cameras is not None else set()
+    said = {view.view_id for view in cameras.views if not view.posed} if cameras is not None else set()
     for method in methods:
-        lost = [view["id"] for view in method["views"] if not view["posed"] and view["id"] not in said]
+        lost = [view.view_id for view in method.views if not view.posed and view.view_id not in said]
         if lost:
-            found.append(
-                f"{method['name']}: no camera could be estimated for {', '.join(lost)}; a placeholder was used."
-            )
+            found.append(f"{method.name}: no camera could be estimated for {', '.join(lost)}; a placeholder was used.")
     if parameters.get("warning"):
         found.append(f"Inserted picture: {parameters['warning']}.")
     return found
 
 
-def _statistics(folder: Path) -> dict[str, Any]:
-    return {path.stem: read_json(path) for path in sorted(folder.glob("*.json"))} if folder.is_dir() else {}
+def _statistics(folder: Path) -> dict[str, StageRun]:
+    if not folder.is_dir():
+        return {}
+    return {
+        path.stem: read_typed(StageRun, read_json(path), path, extra=True) for path in sorted(folder.glob("*.json"))
+    }
 
 
-def _read_if_any(path: Path | None) -> Any:
-    """Content of a file that only some runs have; None without it."""
-    return read_json(path) if path is not None and path.is_file() else None
+def _read_if_any(schema: type[T], path: Path | None) -> T | None:
+    """What a file holds that only some runs have; None without it."""
+    return read_typed(schema, read_json(path), path, extra=True) if path is not None and path.is_file() else None
 
 
 def _copy(source: Path, folder: Path, place: str) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from sceneexpander.artifacts.quantities import DRIFT_ALL, LOOKS, Quantity, drift_of_all
-from sceneexpander.report.words import method_words
+from sceneexpander.artifacts.page import Judgement, LookPage, LooksPage, MethodPage, Refinement
+from sceneexpander.catalogue import LOOKS, Metric
+from sceneexpander.catalogue.course import DRIFT_ALL, drift_of_all
+from sceneexpander.report.words import method_label
 
 FITTED = "Its Gaussians were fitted to its pictures: PSNR, SSIM and ST-LPIPS are those of pictures it was fitted to."
 
@@ -48,31 +49,31 @@ class Verdict:
     refused: bool
 
 
-def looks_shown(looks: Mapping[str, Any] | None) -> LooksShown | None:
+def looks_shown(looks: LooksPage | None) -> LooksShown | None:
     """The gathered looks of a round, one card each; None if there was none."""
     if looks is None:
         return None
-    first = looks["entries"][0]
+    first = looks.looks[0]
     return LooksShown(
         cards=tuple(
             LookCard(
-                heading=f"after step {look['step']}" if look["step"] else "before the first step",
-                render=look["pictures"].get("inserted"),
-                depth=look["pictures"].get("depth"),
+                heading=f"after step {look.step}" if look.step else "before the first step",
+                render=look.pictures.get("inserted"),
+                depth=look.pictures.get("depth"),
                 numbers=tuple(_number(item, look, None if look is first else first) for item in LOOKS),
             )
-            for look in looks["entries"]
+            for look in looks.looks
         ),
         meanings=tuple((item.title, item.meaning) for item in LOOKS),
-        warnings=tuple(looks["warnings"]),
+        warnings=looks.warnings,
     )
 
 
-def _value(look: Mapping[str, Any], item: Quantity) -> float:
-    return drift_of_all(look) if item is DRIFT_ALL else float(look[item.name])
+def _value(look: LookPage, item: Metric) -> float:
+    return drift_of_all(look.drift) if item is DRIFT_ALL else look.values[item.name]
 
 
-def _number(item: Quantity, look: Mapping[str, Any], first: Mapping[str, Any] | None) -> LookNumber:
+def _number(item: Metric, look: LookPage, first: LookPage | None) -> LookNumber:
     value, gain = _value(look, item), ""
     # The other numbers are differences already.
     if first is not None and item.better == "higher":
@@ -81,45 +82,38 @@ def _number(item: Quantity, look: Mapping[str, Any], first: Mapping[str, Any] | 
     return LookNumber(label=item.title, text=item.text_with_unit(value), gain=gain)
 
 
-def verdict(acceptance: Mapping[str, Any] | None) -> Verdict | None:
+def verdict(judgement: Judgement | None) -> Verdict | None:
     """What was found out about the inserted view before anything was adapted; None if nothing was."""
-    if acceptance is None:
+    if judgement is None:
         return None
-    if acceptance["reasons"]:
-        reasons = "; ".join(acceptance["reasons"])
+    if judgement.reasons:
+        reasons = "; ".join(judgement.reasons)
         return Verdict(
             text=f"The inserted view fits badly, which was known before the adaptation: {reasons}. It was inserted all the same.",
             refused=True,
         )
-    parts = [f"captured views see {100 * acceptance['overlap']:.0f} % of it"]
-    depth, colour = acceptance["depth_conflict"], acceptance["colour_conflict"]
-    if depth is not None:
-        parts.append(f"its depth differs from theirs by {100 * depth:.1f} %")
-    if colour is not None:
-        parts.append(f"its colours by {100 * colour:.1f} %")
-    parts.append(f"it turns captured cameras by {acceptance['cameras_moved_deg']:.2f} degrees at most")
+    parts = [f"captured views see {100 * judgement.overlap:.0f} % of it"]
+    if judgement.depth_conflict is not None:
+        parts.append(f"its depth differs from theirs by {100 * judgement.depth_conflict:.1f} %")
+    if judgement.colour_conflict is not None:
+        parts.append(f"its colours by {100 * judgement.colour_conflict:.1f} %")
+    parts.append(f"it turns captured cameras by {judgement.cameras_moved_deg:.2f} degrees at most")
     return Verdict(
         text=f"Before the adaptation, the inserted view was found to fit: {', '.join(parts)}.", refused=False
     )
 
 
-def was_fitted(method: Mapping[str, Any]) -> bool:
-    """Whether a fit of the method's Gaussians to their pictures was kept."""
-    refinement = method["refinement"]
-    return refinement is not None and refinement["after"] < refinement["before"]
-
-
-def fits(methods: Sequence[Mapping[str, Any]]) -> list[str]:
+def fits(methods: Sequence[MethodPage]) -> list[str]:
     """A line for each method whose Gaussians were fitted to their pictures: what that changed."""
     return [
-        f"Gaussians of {method_words(item['name'], item['model']).label}: {_fit(item['refinement'])}"
+        f"Gaussians of {method_label(item.name, item.model)}: {_fit(item.refinement)}"
         for item in methods
-        if item["refinement"] is not None
+        if item.refinement is not None
     ]
 
 
-def _fit(refinement: Mapping[str, Any]) -> str:
-    steps, before, after = refinement["steps"], refinement["before"], refinement["after"]
-    if after < before:
+def _fit(refinement: Refinement) -> str:
+    steps, before, after = refinement.steps, refinement.before, refinement.after
+    if refinement.kept:
         return f"photometric loss {before:.4f} to {after:.4f} in {steps} steps"
     return f"kept as they were, {steps} steps did not lower the photometric loss of {before:.4f}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP, _RIGHT = 560.0, 280.0, 78.0, 34.0, 14.0, 12.0
@@ -19,22 +19,21 @@ class Curve:
     points: tuple[tuple[int, float], ...]
 
 
-def objective_curves(series: Mapping[str, Sequence[float]]) -> list[Curve]:
+def objective_curves(inserted: Sequence[bool], loss: Sequence[float]) -> list[Curve]:
     """The objective of the steps that also saw the inserted view, and of those that did not: they have different terms to pay for.
 
     Args:
-        series: ``loss`` and ``inserted``, one entry per step; a kind of step that never came has no curve.
+        inserted: whether each step saw it; a kind of step that never came has no curve.
+        loss: of each step.
     """
-    steps = list(zip(series.get("inserted", ()), series.get("loss", ()), strict=True))
+    steps = list(zip(inserted, loss, strict=True))
     kinds = (("with", "with the inserted view", True), ("without", "captured views alone", False))
     curves = [
         Curve(
             name=name,
             title=title,
             points=tuple(
-                (step, value)
-                for step, (inserted, value) in enumerate(steps, 1)
-                if bool(inserted) is wanted and math.isfinite(value)
+                (step, value) for step, (seen, value) in enumerate(steps, 1) if seen is wanted and math.isfinite(value)
             ),
         )
         for name, title, wanted in kinds

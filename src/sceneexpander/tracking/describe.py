@@ -12,20 +12,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sceneexpander.artifacts.cameras import CameraReport
 from sceneexpander.artifacts.metrics import MetricsRow
-from sceneexpander.artifacts.quantities import (
-    DRIFT_ALL,
-    GEOMETRY,
-    GROUP_MEANINGS,
-    INSERTION,
-    LOOKS,
-    METHOD_TITLES,
-    OBJECTIVES,
-    PEAK_MEMORY,
-    QUALITY,
-    TIME_ALL,
-    Quantity,
-)
+from sceneexpander.catalogue import GROUP_MEANINGS, LOOKS, OBJECTIVES, Group, Metric, Shown, measured_metrics
+from sceneexpander.catalogue.course import DRIFT_ALL, PEAK_MEMORY, WALL_TIME
+from sceneexpander.catalogue.metrics import metrics_named
 
 NOTE_TAG = "mlflow.note.content"
 KIND_TAG = "mlflow.experimentKind"
@@ -38,10 +29,8 @@ LEFT_OUT_TAG = "cameras.left_out"
 _RUN_NAME = "attributes.`Run Name`"
 _WHEN = {"runDateAndNestInfo": 130, "duration": 90}  # columns that are always there: after what was measured
 _LONGEST = 4900  # characters of a tag; MLflow takes 5000
-_SHOWN_QUALITY = tuple(item for item in QUALITY if item.meaning)
-_SHOWN_INSERTION = tuple(item for item in INSERTION if item.meaning)
-_SHOWN_GEOMETRY = tuple(item for item in GEOMETRY if item.meaning)
-_HEADLINE = (*_SHOWN_QUALITY[:1], *_SHOWN_INSERTION[:1], *_SHOWN_GEOMETRY[:1])
+FIRST_VIEW = "quality"
+_HEADLINE = metrics_named("psnr_at_photo_size_db", "psnr_at_picture_size_db", "camera_rotation_deg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,9 +40,9 @@ class SavedView:
     key: str
     name: str
     params: tuple[str, ...]
-    first: tuple[Quantity, ...]
+    first: tuple[Metric, ...]
     tags: tuple[str, ...] = ()
-    further: tuple[Quantity, ...] = ()
+    further: tuple[Metric, ...] = ()
 
     def columns(self) -> list[str]:
         """The columns as MLflow calls them."""
@@ -65,28 +54,32 @@ class SavedView:
         ]
 
 
-VIEWS = (
-    SavedView(
-        key="quality",
-        name="Quality: photos and inserted view",
-        params=("method", "gaussians"),
-        first=(_SHOWN_QUALITY[0], _SHOWN_INSERTION[0]),
-        tags=(CAMERAS_TAG,),
-        further=(*_SHOWN_QUALITY[1:], *_SHOWN_INSERTION[1:]),
-    ),
-    SavedView(
-        key="geometry",
-        name="Cameras and depth",
-        params=("method",),
-        first=_SHOWN_GEOMETRY,
-        tags=(LEFT_OUT_TAG, CAMERAS_TAG),
-    ),
-    SavedView(
-        key="adaptation", name="Adaptation", params=("method", "adapt.steps"), first=(*LOOKS, *OBJECTIVES.values())
-    ),
-    SavedView(key="cost", name="Time and memory", params=("method", "device"), first=(TIME_ALL, PEAK_MEMORY)),
-)
-FIRST_VIEW = VIEWS[0].key
+def saved_views() -> tuple[SavedView, ...]:
+    """The views of the table of runs; the first one is what links to the numbers open."""
+    quality = measured_metrics(Group.QUALITY, shown=Shown.PAGE)
+    insertion = measured_metrics(Group.INSERTION, shown=Shown.PAGE)
+    first = tuple(metric for metric in _HEADLINE if metric in (*quality, *insertion))
+    return (
+        SavedView(
+            key=FIRST_VIEW,
+            name="Quality: photos and inserted view",
+            params=("method", "gaussians"),
+            first=first,
+            tags=(CAMERAS_TAG,),
+            further=tuple(metric for metric in (*quality, *insertion) if metric not in first),
+        ),
+        SavedView(
+            key="geometry",
+            name="Cameras and depth",
+            params=("method",),
+            first=measured_metrics(Group.GEOMETRY, shown=Shown.PAGE),
+            tags=(LEFT_OUT_TAG, CAMERAS_TAG),
+        ),
+        SavedView(
+            key="adaptation", name="Adaptation", params=("method", "adapt.steps"), first=(*LOOKS, *OBJECTIVES.values())
+        ),
+        SavedView(key="cost", name="Time and memory", params=("method", "device"), first=(WALL_TIME, PEAK_MEMORY)),
+    )
 
 
 def experiment_links(base: str, experiment: str) -> dict[str, str]:
@@ -103,7 +96,7 @@ def experiment_note() -> str:
     """What a run is, what to look at first, which columns: Markdown."""
     groups = "\n".join(f"- `{group}`: {meaning}" for group, meaning in GROUP_MEANINGS.items())
     first = ", ".join(f"`{item.tracked}` ({_arrow(item)})" for item in _HEADLINE)
-    views = ", ".join(f"*{view.name}*" for view in VIEWS)
+    views = ", ".join(f"*{view.name}*" for view in saved_views())
     return "\n".join(
         [
             "Photos of a place and a sentence become a larger 3D scene. **A run is one method in one round of one scene**; runs of one "
@@ -127,17 +120,17 @@ def experiment_note() -> str:
     )
 
 
-def _arrow(item: Quantity) -> str:
+def _arrow(item: Metric) -> str:
     return f"{item.better} is better"
 
 
 def run_note(
-    prompt: str, method: str, row: MetricsRow | None, cameras: Mapping[str, Any] | None, warnings: Sequence[str]
+    prompt: str, title: str, row: MetricsRow | None, cameras: CameraReport | None, warnings: Sequence[str]
 ) -> str:
     """The sentence, the method, its result in a line, and everything that is not as it should be: Markdown."""
     parts = [
         "> " + " ".join(prompt.split()),
-        METHOD_TITLES.get(method, method) + ("" if row is None else row.fit.mark) + ".",
+        f"{title}.",
     ]
     if row is not None:
         known = [(item, row.value(item.name)) for item in _HEADLINE]
@@ -145,8 +138,8 @@ def run_note(
             "; ".join(f"{item.title} **{item.text_with_unit(v)}**" for item, v in known if v is not None) + "."
         )
     if cameras is not None:
-        parts.append(f"Cameras: {cameras['summary']}.")
-    problems = [*(cameras["problems"] if cameras is not None else ()), *warnings]
+        parts.append(f"Cameras: {cameras.summary()}.")
+    problems = [*(cameras.problems() if cameras is not None else ()), *warnings]
     if problems:
         parts.append("\n".join(f"- {line}" for line in problems))
     return cut("\n\n".join(parts))
@@ -163,7 +156,8 @@ def describe_experiment(client: Any, experiment: str) -> None:
     A description that a person has changed stays as it is.
     """
     tags: Mapping[str, str] = client.get_experiment(experiment).tags
-    wanted = {f"{VIEW_TAG}{view.key}": _state(view, place) for place, view in enumerate(VIEWS)}
+    views = saved_views()
+    wanted = {f"{VIEW_TAG}{view.key}": _state(view, len(views) - place) for place, view in enumerate(views)}
     note = experiment_note()
     known = tags.get(NOTE_TAG)
     if known is None or _hash(known) == tags.get(OWN_NOTE_TAG):
@@ -187,9 +181,8 @@ def _width(column: str) -> int:
     return 40 + 13 * len(name) // 2
 
 
-def _state(view: SavedView, place: int) -> str:
-    # The menu shows the newest first.
-    made = len(VIEWS) - place
+def _state(view: SavedView, made: int) -> str:
+    """What MLflow keeps of a view; its menu shows the one with the largest ``made`` first."""
     widths = {"0": 73, _RUN_NAME: 330, **{column: _width(column) for column in view.columns()}, **_WHEN}
     state = {
         "selectedColumns": view.columns(),

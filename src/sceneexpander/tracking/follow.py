@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.live import LOG_NAME, read_live
-from sceneexpander.artifacts.quantities import tracked_look, tracked_step
+from sceneexpander.artifacts.live import LOG_NAME, LiveEnd, LiveLine, LiveLook, LiveRun, LiveStep, read_live
+from sceneexpander.catalogue import MAIN
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.describe import describe_experiment
-from sceneexpander.tracking.record import flatten
 from sceneexpander.tracking.store import COMPLETE_TAG, LIVE_TAG, open_store, store_lock
+from sceneexpander.tracking.tracked import tracked_look, tracked_step
 
 _log = logging.getLogger(__name__)
 
@@ -60,11 +60,11 @@ class Follower:
 
         lines = list(read_live(folder))
         identity = folder.name
-        if not lines or lines[0].get("kind") != "run" or self._done.get(identity) == lines[0]["started"]:
+        if not lines or not isinstance(lines[0], LiveRun) or self._done.get(identity) == lines[0].started:
             return 0
         client, experiment = open_store(self.config, self.root)
         known = self._known.get(identity)
-        if known is None or known.started != lines[0]["started"]:
+        if known is None or known.started != lines[0].started:
             known = self._begin(client, experiment, identity, lines[0])
             if known is None:
                 return 0
@@ -78,7 +78,7 @@ class Follower:
             del self._known[identity]
             return 0
         known.lines = len(lines)
-        if lines[-1]["kind"] == "end":
+        if isinstance(lines[-1], LiveEnd):
             client.set_terminated(known.run_id, "FINISHED")
             self._done[identity] = known.started
         elif not new and time.time() - (folder / LOG_NAME).stat().st_mtime > STALE_S:
@@ -86,28 +86,29 @@ class Follower:
             self._done[identity] = known.started
         return len(new)
 
-    def _begin(self, client: Any, experiment: str, identity: str, facts: Mapping[str, Any]) -> _Mirrored | None:
+    def _begin(self, client: Any, experiment: str, identity: str, begun: LiveRun) -> _Mirrored | None:
         """A fresh run for a log; None if the whole run is recorded already."""
         with store_lock(self.root):
             for run in client.search_runs([experiment], f"tags.{LIVE_TAG} = '{identity}'"):
                 if COMPLETE_TAG in run.data.tags:
-                    self._done[identity] = facts["started"]
+                    self._done[identity] = begun.started
                     return None
                 client.delete_run(run.info.run_id)
             describe_experiment(client, experiment)
-            name = f"{facts['scene']} r{facts['round']} sceneexpander, running"
-            tags = {LIVE_TAG: identity, "scene": facts["scene"], "round": str(facts["round"]), "mlflow.runName": name}
-            started_ms = int(1000 * facts["started"])
+            name = f"{begun.scene} r{begun.round} {MAIN}, running"
+            tags = {LIVE_TAG: identity, "scene": begun.scene, "round": str(begun.round), "mlflow.runName": name}
+            started_ms = int(1000 * begun.started)
             run = client.create_run(experiment, start_time=started_ms, tags=tags, run_name=name)
-        for key, value in flatten(facts["sections"]).items():
+        for key, value in begun.settings.items():
             client.log_param(run.info.run_id, key, value)
-        return _Mirrored(run_id=run.info.run_id, started=facts["started"])
+        return _Mirrored(run_id=run.info.run_id, started=begun.started)
 
-    def _send(self, client: Any, known: _Mirrored, folder: Path, lines: list[dict[str, Any]]) -> None:
+    def _send(self, client: Any, known: _Mirrored, folder: Path, lines: Sequence[LiveLine]) -> None:
         from mlflow.entities import Metric
 
         now = int(1000 * time.time())
-        metrics = [Metric(key, value, now, line["step"]) for line in lines for key, value in _numbers(line).items()]
+        points = [(line.step, _numbers(line)) for line in lines if isinstance(line, LiveStep | LiveLook)]
+        metrics = [Metric(key, value, now, step) for step, numbers in points for key, value in numbers.items()]
         for begin in range(0, len(metrics), 1000):
             client.log_batch(known.run_id, metrics=metrics[begin : begin + 1000])
         for picture in sorted((folder / "looks").glob("*.jpg")):
@@ -116,8 +117,8 @@ class Follower:
                 known.pictures.add(picture.name)
 
 
-def _numbers(line: Mapping[str, Any]) -> dict[str, float]:
+def _numbers(line: LiveStep | LiveLook) -> dict[str, float]:
     """Curves of a line, named as in a whole run."""
-    if line["kind"] == "step":
-        return tracked_step(line)
-    return tracked_look(line) if line["kind"] == "look" else {}
+    if isinstance(line, LiveStep):
+        return tracked_step(line.values, inserted=line.inserted)
+    return tracked_look(line.values, line.drift)

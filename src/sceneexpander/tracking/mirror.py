@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
+from sceneexpander.artifacts.cameras import CameraReport
 from sceneexpander.artifacts.metrics import MetricsRow
-from sceneexpander.artifacts.quantities import tracked_cost, tracked_look, tracked_row, tracked_step
-from sceneexpander.artifacts.store import read_json
+from sceneexpander.artifacts.page import MethodPage, MissingMethod, RoundPage, ScenePage
+from sceneexpander.catalogue import MAIN
+from sceneexpander.catalogue.methods import CAPTURED, known_method, method_title
 from sceneexpander.tracking.describe import CAMERAS_TAG, LEFT_OUT_TAG, NOTE_TAG, cut, run_note
-from sceneexpander.tracking.record import RunRecord, flatten, run_key
+from sceneexpander.tracking.record import RunRecord, run_key
 from sceneexpander.tracking.store import LIVE_TAG
-
-FACTS = "page.json"
+from sceneexpander.tracking.tracked import tracked_cost, tracked_look, tracked_row, tracked_step
 
 
 def variant_name(overrides: Sequence[str]) -> str:
@@ -31,32 +31,25 @@ def scene_runs(
         commit: version of the sources, as a tag.
         extra: more files to keep with the run of a round and method, e.g. the Gaussians and the report page.
     """
-    facts = read_json(folder / FACTS)
+    page = ScenePage.load(folder)
     return [
-        _run(facts, item, method, folder, commit, extra(item["number"], method["name"]))
-        for item in facts["rounds"]
-        for method in item["methods"]
-    ] + [
-        _unavailable(facts, item, method, folder, commit) for item in facts["rounds"] for method in item["unavailable"]
-    ]
+        _run(page, item, method, folder, commit, extra(item.number, method.name))
+        for item in page.rounds
+        for method in item.methods
+    ] + [_unavailable(page, item, method, folder, commit) for item in page.rounds for method in item.unavailable]
 
 
 def _run(
-    facts: Mapping[str, Any],
-    item: Mapping[str, Any],
-    method: Mapping[str, Any],
-    folder: Path,
-    commit: str,
-    extra: Sequence[Path],
+    page: ScenePage, item: RoundPage, method: MethodPage, folder: Path, commit: str, extra: Sequence[Path]
 ) -> RunRecord:
-    row = MetricsRow.load(folder / method["metrics"])
-    scene, number, name = folder.name, item["number"], method["name"]
-    variant = variant_name(facts["overrides"])
-    stages = {stage: entry for stage, entry in item["statistics"].items() if _belongs(stage, name)}
-    adapted = name == "sceneexpander"
-    cameras = _cameras(facts, item, name)
+    row = MetricsRow.load(folder / method.metrics)
+    scene, number, name = folder.name, item.number, method.name
+    variant = variant_name(page.overrides)
+    stages = {stage: run for stage, run in item.statistics.items() if _belongs(stage, name)}
+    adapted = name == MAIN
+    cameras = page.cameras if name == CAPTURED else item.cameras
     return RunRecord(
-        key=run_key(facts["config"], facts["overrides"], row.numbers(), scene, number, name, row.weights_sha256),
+        key=run_key(page.settings, page.overrides, row.numbers(), scene, number, name, row.weights_sha256),
         name=f"{scene} r{number} {name}{row.fit.mark}" + ("" if variant == "default" else f" [{variant}]"),
         params={
             "variant": variant,
@@ -65,10 +58,10 @@ def _run(
             "method": name,
             "gaussians": row.fit.value,
             "reconstructor": row.model,
-            "prompt": item["prompt"],
-            **flatten(facts["config"]),
+            "prompt": item.prompt,
+            **page.settings,
         },
-        metrics=tracked_row(row) | tracked_cost({stage.partition("-")[0]: entry for stage, entry in stages.items()}),
+        metrics=tracked_row(row) | tracked_cost({stage.partition("-")[0]: run for stage, run in stages.items()}),
         curves=_curves(item) if adapted else {},
         artefacts=_artefacts(item, method, folder, extra) | (_look_pictures(item, folder) if adapted else {}),
         tags={
@@ -79,35 +72,31 @@ def _run(
             "variant": variant,
             "reconstructor": row.model,
             "weights_sha256": row.weights_sha256,
-            "base_weights_sha256": str(facts["model"]["weights_sha256"]),
+            "base_weights_sha256": page.model.weights_sha256,
             "mlflow.source.git.commit": commit,
-            NOTE_TAG: run_note(item["prompt"], name, row, cameras, item["warnings"]),
+            NOTE_TAG: run_note(item.prompt, method_title(name, row.model) + row.fit.mark, row, cameras, item.warnings),
             **_camera_tags(cameras),
-            **({LIVE_TAG: item["looks"]["identity"]} if adapted and item["looks"] else {}),
+            **({LIVE_TAG: item.looks.identity} if adapted and item.looks else {}),
         },
-        started_ms=int(1000 * min((entry["started"] for entry in stages.values()), default=0.0)),
-        duration_ms=int(1000 * sum(entry["wall_s"] for entry in stages.values())),
+        started_ms=int(1000 * min((run.started for run in stages.values()), default=0.0)),
+        duration_ms=int(1000 * sum(run.wall_s for run in stages.values())),
     )
 
 
-def _cameras(facts: Mapping[str, Any], item: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
-    """What is known of the cameras that a method was given; None where nothing is."""
-    given: Mapping[str, Any] | None = facts["cameras"] if method == "captured" else item["cameras"]
-    return given
-
-
-def _camera_tags(cameras: Mapping[str, Any] | None) -> dict[str, str]:
+def _camera_tags(cameras: CameraReport | None) -> dict[str, str]:
     if cameras is None:
         return {}
-    return {CAMERAS_TAG: cut(cameras["summary"]), LEFT_OUT_TAG: str(len(cameras["views"]) - cameras["posed"])}
+    return {CAMERAS_TAG: cut(cameras.summary()), LEFT_OUT_TAG: str(len(cameras.views) - cameras.posed)}
 
 
-def _curves(item: Mapping[str, Any]) -> dict[str, list[tuple[int, float]]]:
+def _curves(item: RoundPage) -> dict[str, list[tuple[int, float]]]:
     """Curves of the adaptation's steps, and of what its looks saw."""
-    series = item["series"]
-    steps = [dict(zip(series, values, strict=True)) for values in zip(*series.values(), strict=True)]
-    points = [(number, tracked_step(step)) for number, step in enumerate(steps, 1)]
-    points += [(look["step"], tracked_look(look)) for look in (item["looks"]["entries"] if item["looks"] else ())]
+    steps = [
+        tracked_step({name: values[index] for name, values in item.steps.values.items()}, inserted=inserted)
+        for index, inserted in enumerate(item.steps.inserted)
+    ]
+    points = list(enumerate(steps, 1))
+    points += [(look.step, tracked_look(look.values, look.drift)) for look in (item.looks.looks if item.looks else ())]
     curves: dict[str, list[tuple[int, float]]] = {}
     for step, numbers in points:
         for name, value in numbers.items():
@@ -115,52 +104,44 @@ def _curves(item: Mapping[str, Any]) -> dict[str, list[tuple[int, float]]]:
     return curves
 
 
-def _look_pictures(item: Mapping[str, Any], folder: Path) -> dict[str, Path]:
-    looks = item["looks"]["entries"] if item["looks"] else ()
-    return {f"looks/{Path(path).name}": folder / path for look in looks for path in look["pictures"].values()}
+def _look_pictures(item: RoundPage, folder: Path) -> dict[str, Path]:
+    looks = item.looks.looks if item.looks else ()
+    return {f"looks/{Path(path).name}": folder / path for look in looks for path in look.pictures.values()}
 
 
-def _unavailable(
-    facts: Mapping[str, Any], item: Mapping[str, Any], method: Mapping[str, Any], folder: Path, commit: str
-) -> RunRecord:
+def _unavailable(page: ScenePage, item: RoundPage, method: MissingMethod, folder: Path, commit: str) -> RunRecord:
     """A run without a number: a comparison shows the gap and why it is there."""
-    scene, number, name = folder.name, item["number"], method["name"]
-    variant = variant_name(facts["overrides"])
-    identity = {"variant": variant, "round": str(number), "method": name, "reconstructor": method["model"]}
+    scene, number, name = folder.name, item.number, method.name
+    variant = variant_name(page.overrides)
+    identity = {"variant": variant, "round": str(number), "method": name, "reconstructor": method.model}
     return RunRecord(
-        key=run_key(facts["config"], facts["overrides"], method["reason"], scene, number, name),
-        name=f"{scene} r{number} {name}: {method['reason']}" + ("" if variant == "default" else f" [{variant}]"),
-        params={**identity, "scene_name": scene, "prompt": item["prompt"], **flatten(facts["config"])},
+        key=run_key(page.settings, page.overrides, method.reason, scene, number, name),
+        name=f"{scene} r{number} {name}: {method.reason}" + ("" if variant == "default" else f" [{variant}]"),
+        params={**identity, "scene_name": scene, "prompt": item.prompt, **page.settings},
         metrics={},
         tags={
             **identity,
             "scene": scene,
-            "unavailable": method["reason"],
+            "unavailable": method.reason,
             "mlflow.source.git.commit": commit,
-            NOTE_TAG: run_note(item["prompt"], name, None, None, [method["reason"]]),
+            NOTE_TAG: run_note(item.prompt, method_title(name, method.model), None, None, [method.reason]),
         },
     )
 
 
 def _belongs(stage: str, method: str) -> bool:
     """Whether a stage's time counts for a method: its own renders and evaluation, and what made it."""
-    makers = {"captured": "precompute_anchors", "backbone": "reconstruct_inserted", "sceneexpander": "adapt"}
-    return stage.endswith(f"-{method}") or stage == makers.get(method, method)
+    known = known_method(method)
+    return stage.endswith(f"-{method}") or stage == (method if known is None else known.stage)
 
 
-def _artefacts(
-    item: Mapping[str, Any], method: Mapping[str, Any], folder: Path, extra: Sequence[Path]
-) -> dict[str, Path]:
-    found = {"inserted/" + Path(item["inserted"]).name: folder / item["inserted"]}
-    if item["sheet"]:
-        found["inserted/" + Path(item["sheet"]).name] = folder / item["sheet"]
-    for path in method["videos"].values():
-        found["videos/" + Path(path).name] = folder / path
-    for still in method["stills"]:
-        found |= {"stills/" + Path(path).name: folder / path for layer, path in still.items() if layer != "frame"}
-    found |= {"views/" + Path(path).name: folder / path for path in method["view_pictures"].values()}
-    found["metrics.json"] = folder / method["metrics"]
-    if item["problems"]:
-        found["cameras.txt"] = folder / item["problems"]
-    found |= {path.name: path for path in extra}
-    return found
+def _artefacts(item: RoundPage, method: MethodPage, folder: Path, extra: Sequence[Path]) -> dict[str, Path]:
+    places = {"inserted": [item.inserted, *([item.sheet] if item.sheet else [])]}
+    places["videos"] = list(method.videos.values())
+    places["stills"] = [path for still in method.stills for path in still.pictures.values()]
+    places["views"] = list(method.view_pictures.values())
+    found = {f"{kind}/{Path(path).name}": folder / path for kind, paths in places.items() for path in paths}
+    found["metrics.json"] = folder / method.metrics
+    if item.problems:
+        found["cameras.txt"] = folder / item.problems
+    return found | {path.name: path for path in extra}

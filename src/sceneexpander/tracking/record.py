@@ -7,7 +7,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,18 +34,6 @@ class RunRecord:
     tags: Mapping[str, str] = field(default_factory=dict)
     started_ms: int = 0
     duration_ms: int = 0
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Nested settings as dotted keys with text values."""
-    flat: dict[str, str] = {}
-    for key, value in values.items():
-        path = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            flat |= flatten(value, f"{path}.")
-        else:
-            flat[path] = value if isinstance(value, str) else json.dumps(value)
-    return flat
 
 
 def run_key(*parts: object) -> str:

@@ -25,7 +25,7 @@ KEY_TAG = "run_key"
 LIVE_TAG = "adaptation"  # identity of the adaptation that a run mirrors or holds, see `sceneexpander.tracking.follow`
 COMPLETE_TAG = "complete"  # set last: a recording that was killed half-way is done again
 NAMES = (
-    "2"  # its value: the scheme of the metrics' names; a run that has other names gives way when it is recorded again
+    "3"  # its value: the scheme of the metrics' names; a run that has other names gives way when it is recorded again
 )
 _PARAMS_PER_CALL = 100  # limits of MLflow's batch call
 _METRICS_PER_CALL = 1000

@@ -12,23 +12,13 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.unavailable import unavailable_in
+from sceneexpander.catalogue import MAIN
+from sceneexpander.catalogue.methods import known_methods
 from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import UserError, entry_point
 from sceneexpander.viewer.gate import check_authority
 from sceneexpander.viewer.live import HOST, LiveViewer
 
-METHODS = (  # the last one that exists is shown first
-    "omnivggt",
-    "omnivggt_optimised",
-    "ttt3r",
-    "ttt3r_optimised",
-    "gaussian_splatting",
-    "captured",
-    "backbone",
-    "corrected",
-    "sceneexpander_optimised",
-    "sceneexpander",
-)
 LIMIT = 400_000
 LAST_PORT = 64_535  # a thousand below the end: the next free one is taken if it is in use
 
@@ -46,7 +36,9 @@ def load_round(folder: Path, number: int) -> tuple[str, list[Reconstruction], di
     if not (folder / "scene").is_dir():
         raise UserError("holds no scene", where=folder, fix="run `make repro` first, or name another scene")
     base = folder / f"round_{number}"
-    found = [base / method / "reconstruction" for method in METHODS]
+    # The last one that exists is shown first.
+    names = sorted((method.name for method in known_methods()), key=lambda name: name == MAIN)
+    found = [base / name / "reconstruction" for name in names]
     found = [path for path in found if path.is_dir() and unavailable_in(path) is None]
     if not found:
         rounds = sorted(path.name.removeprefix("round_") for path in folder.glob("round_[1-9]*"))

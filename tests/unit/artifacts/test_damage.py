@@ -21,7 +21,23 @@ from sceneexpander.adaptation.checkpoint import Checkpoint as AdaptationCheckpoi
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
-from sceneexpander.artifacts.metrics import MetricsRow, TruthMetrics, UnavailableRow, ViewMetrics, load_row
+from sceneexpander.artifacts.metrics import MetricsRow, UnavailableRow, ViewMetrics, load_row
+from sceneexpander.artifacts.page import (
+    BaseModel,
+    Judgement,
+    LookPage,
+    LooksPage,
+    MethodPage,
+    MissingMethod,
+    Photo,
+    Refinement,
+    RoundPage,
+    ScenePage,
+    ShownView,
+    StageRun,
+    Steps,
+    Still,
+)
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
@@ -79,14 +95,40 @@ def scene() -> Scene:
 
 
 def metrics() -> MetricsRow:
-    view = ViewMetrics(
-        view_id="v", generated=False, posed=True, psnr_db=20.0, ssim=0.9, coverage=1.0, generated_share=0.0
-    )
+    view = ViewMetrics(view_id="v", generated=False, posed=True, values={"psnr_captured_db": 20.0})
     return MetricsRow(
-        scene="room", round=1, method="backbone", model="mini", weights_sha256="a", seed=0, captured_views=2, generated_views=1,
-        gaussians=9, generated_gaussians=3, psnr_db=20.0, ssim=0.9, coverage=1.0, truth=TruthMetrics(camera_ate=0.1),
-        spread={"psnr_db": 0.1}, views=(view,), versions={"torch": "2"},
+        scene="room", round=1, method="backbone", model="mini", weights_sha256="a", seed=0,
+        values={"psnr_captured_db": 20.0, "camera_ate": 0.1}, spread={"psnr_captured_db": 0.1}, views=(view,), versions={"torch": "2"},
     )  # fmt: skip
+
+
+def save_page(folder: Path) -> None:
+    method = MethodPage(
+        name="backbone", model="mini", weights_sha256="a", licence=None, refinement=Refinement(steps=3, before=0.2, after=0.1),
+        views=(ShownView(view_id="v", generated=False, posed=True),), videos={"rgb": "rgb.mp4"},
+        stills=(Still(frame=0, pictures={"rgb": "s.png"}),), view_pictures={"v": "v.png"}, frames=2, fps=24, inserted_frame=1,
+        inserted_camera="own", width=6, height=4, gaussians=3, metrics="m.json", map="<svg/>",
+    )  # fmt: skip
+    look = LookPage(step=0, values={"captured_psnr": 20.0}, drift={"a": 0.1}, pictures={"depth": "d.jpg"})
+    one = RoundPage(
+        number=1, prompt="a bench", motion="", new_object="", full_prompt="a bench", backend="replay", origin="a.png",
+        source_type=None, ranking=(), parameters={"warning": "w"}, candidates=1, inserted="i.jpg", inserted_id="v2",
+        viewer="viewer.html", sheet=None, methods=(method,),
+        unavailable=(MissingMethod(name="ttt3r", model="ttt3r", reason="r", metrics="n.json"),),
+        steps=Steps(inserted=(True, False), values={"loss": (1.0, 2.0)}),
+        looks=LooksPage(identity="abc", looks=(look,), warnings=()), cameras=camera_report(), problems="cameras.txt",
+        judgement=Judgement(overlap=0.5, depth_conflict=None, colour_conflict=0.1, cameras_moved_deg=0.0, reasons=()),
+        statistics={"adapt": StageRun(started=1.0, wall_s=2.0, peak_rss_mb=3.0)}, warnings=("w",),
+    )  # fmt: skip
+    ScenePage(
+        scene="room", settings={"seed": "0"}, overrides=("seed=0",),
+        model=BaseModel(model="mini", weights_sha256="a", licence="free"),
+        captured=(Photo(view_id="v", name="a.jpg", picture="a.jpg", original=(6, 4), sha256="a"),), cameras=None,
+        statistics={}, rounds=(one,),
+    ).save(folder)  # fmt: skip
+    # The tests below change the file of this name.
+    (folder / "page.json").rename(folder / FACTS_NAME)
+    (folder / "page.json").symlink_to(FACTS_NAME)
 
 
 def save_row(row: MetricsRow | UnavailableRow) -> Callable[[Path], None]:
@@ -116,6 +158,7 @@ KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "cameras": (lambda folder: camera_report().save(folder), CameraReport.load),
     "metrics": (save_row(metrics()), read_row),
     "no metrics": (save_row(UNAVAILABLE), read_row),
+    "page": (save_page, ScenePage.load),
 }
 WITH_TENSORS = ["scene", "anchors", "priors", "renders", "packed", "reconstruction"]
 ODD = [
@@ -272,11 +315,13 @@ def test_every_tensor_that_is_missing_or_of_another_kind_is_refused(kind: str, r
 
 @pytest.mark.parametrize("name", ["../../outside.png", "/etc/passwd", "", "a/../../b", "x" * 2000])
 def test_no_artefact_leads_to_files_outside_of_it(root: Path, name: str) -> None:
-    for kind, key in (("renders", "scene"), ("views", "records")):
+    for kind, key in (("renders", "scene"), ("views", "records"), ("page", "rounds")):
         folder = saved(kind, root)
         facts = json.loads((folder / FACTS_NAME).read_text())
         if kind == "views":
             facts["records"][0]["view_id"] = name
+        elif kind == "page":
+            facts["rounds"][0]["methods"][0]["metrics"] = name
         else:
             facts[key] = name
         assert read(kind, folder, json.dumps(facts)) is not None

@@ -11,7 +11,10 @@ from typing import Any, get_type_hints
 import pytest
 import yaml
 
+from sceneexpander.catalogue import METHODS, Kind, Method
+from sceneexpander.catalogue.methods import CORRECTED, methods_of
 from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.packages import LOCKS
 from stages import layout
 from stages.fingerprint import stage_names
@@ -65,7 +68,7 @@ def filled(path: str) -> str:
             [
                 layout.config("S"),
                 layout.selection("S"),
-                *(layout.given("S", kind) for kind in ("generator", "choice", "model", *layout.RIVALS)),
+                *(layout.given("S", kind) for kind in ("generator", "choice", "model", *methods_of(Kind.RIVAL))),
             ],
         ),
         ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
@@ -92,8 +95,8 @@ def filled(path: str) -> str:
         (
             "correct",
             [
-                layout.reconstruction("S", 2, layout.CORRECTED).parent,
-                layout.statistics("correct", "S", 2, layout.CORRECTED),
+                layout.reconstruction("S", 2, CORRECTED).parent,
+                layout.statistics("correct", "S", 2, CORRECTED),
             ],
         ),
         (
@@ -103,8 +106,8 @@ def filled(path: str) -> str:
         (
             "gaussian_splatting",
             [
-                layout.reconstruction("S", 2, layout.SPLATTED).parent,
-                layout.statistics("gaussian_splatting", "S", 2, layout.SPLATTED),
+                layout.reconstruction("S", 2, "gaussian_splatting").parent,
+                layout.statistics("gaussian_splatting", "S", 2, "gaussian_splatting"),
             ],
         ),
         (
@@ -135,7 +138,7 @@ def test_nothing_persists_but_what_belongs_to_this_machine() -> None:
         for path, options in item.items()
         if options.get("persist")
     }
-    given = {layout.given("S", kind).as_posix() for kind in ("generator", "choice", "model", *layout.RIVALS)}
+    given = {layout.given("S", kind).as_posix() for kind in ("generator", "choice", "model", *methods_of(Kind.RIVAL))}
     # Never restored from the cache of runs (another machine's environment), never copied into it (links to the user's files).
     assert persistent == {"mlflow/tracked.json", layout.CODE.as_posix(), layout.ENVIRONMENT.as_posix()} | given
 
@@ -146,10 +149,32 @@ def test_code_depends_on_the_locks() -> None:
 
 def test_selected_methods_exist() -> None:
     params = yaml.safe_load((ROOT / "params.yaml").read_text())
-    assert set(params["methods"]) <= set(layout.METHODS)
-    assert PIPELINE["rival"]["matrix"]["method"] == list(layout.RIVALS)
-    assert PIPELINE["optimise"]["matrix"]["method"] == list(layout.OPTIMISABLE)
+    assert set(params["methods"]) <= {method.name for method in METHODS}
     assert [item["prev"] for item in params["rounds"]] == [item["k"] - 1 for item in params["rounds"]]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+def test_every_method_of_the_catalogue_is_made_by_its_stage(method: Method) -> None:
+    """A stage that makes several has them in its matrix: what it runs on is part of the name where it optimises another's result."""
+    assert method.stage in PIPELINE
+    made = [filled(path) for path in paths(method.stage, "outs")]
+    axis = PIPELINE[method.stage]["matrix"].get("method")
+    if axis is not None:
+        of_stage = [other for other in METHODS if other.stage == method.stage]
+        ends = {"rival": [other.name for other in of_stage], "optimise": [other.starts_from for other in of_stage]}
+        assert set(axis) == set(ends[method.stage])
+    else:
+        assert {f"outputs/S/round_2/{method.name}"} <= set(made)
+
+
+def test_methods_that_can_be_left_out_are_parameters_of_their_stages() -> None:
+    for method in METHODS:
+        named = tracked(method.stage, "outputs/${item.scene}/methods.yaml")
+        assert bool(named) is not method.always_made, method.name
+
+
+def test_reconstructors_of_others_have_a_section_of_the_configuration() -> None:
+    assert {f.name for f in fields(RivalsConfig)} == {method.name for method in METHODS if method.needs_weights}
 
 
 def test_no_setting_has_a_name_that_the_cache_ignores() -> None:

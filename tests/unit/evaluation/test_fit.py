@@ -8,9 +8,9 @@ import pytest
 
 from sceneexpander.artifacts.metrics import Fit, MetricsRow
 from sceneexpander.artifacts.store import write_json_atomic
+from sceneexpander.catalogue import METHODS, Kind
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
-from sceneexpander.selection import METHODS, OPTIMISABLE, OURS, RIVALS
 from stages import layout
 from stages.evaluate import fit_of
 from stages.runner import Cell
@@ -39,8 +39,9 @@ def test_a_fit_counts_if_it_was_kept(
 
 
 def test_only_methods_that_optimise_need_no_mark_for_it() -> None:
-    assert set(METHODS) - set(layout.OPTIMISED) == {*OURS, layout.CORRECTED, *RIVALS}
-    assert {f"{method}_optimised" for method in OPTIMISABLE} < set(layout.OPTIMISED)
+    optimised = [method for method in METHODS if method.kind is Kind.OPTIMISED]
+    assert all("optimis" in method.title or method.name in ("gaussian_splatting",) for method in optimised)
+    assert not any("optimis" in method.title for method in METHODS if method not in optimised)
 
 
 def test_it_is_kept_with_the_numbers(tmp_path: Path) -> None:

@@ -88,9 +88,8 @@ def test_rows_hold_the_means_over_captured_views() -> None:
     finer = torch.nn.functional.interpolate(views.images, scale_factor=2, mode="bicubic").clamp(0, 1)
     views = dataclasses.replace(views, photos=tuple(to_bytes(finer)))
     row = evaluate(made, views, CONFIG, scene="s", round_number=1, seed=0)
-    own = [view.own for view in row.views if not view.generated]
-    assert row.own is not None
-    assert row.own.psnr_db == pytest.approx(sum(size.psnr_db or 0 for size in own if size) / 2)
-    assert row.value("own.psnr_db") == row.own.psnr_db
-    assert row.numbers()["own_open_share"] == row.own.open_share
-    assert row.inserted_own is not None
+    own = [view.values["psnr_at_photo_size_db"] for view in row.views if not view.generated]
+    assert len(own) == 2
+    assert row.values["psnr_at_photo_size_db"] == pytest.approx(sum(own) / 2)
+    assert 0 <= row.values["seen_through_at_photo_size"] < 1
+    assert "psnr_at_picture_size_db" in row.values

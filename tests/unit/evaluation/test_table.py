@@ -7,28 +7,31 @@ import io
 
 import pytest
 
-from sceneexpander.artifacts.metrics import Fit, MetricsRow, TruthMetrics, UnavailableRow
+from sceneexpander.artifacts.metrics import Fit, MetricsRow, UnavailableRow
 from sceneexpander.evaluation import comparison_table, scene_table
 from sceneexpander.evaluation.repeats import over_repeats
 
 
-def row(scene: str, method: str, psnr_db: float, **more: object) -> MetricsRow:
-    values: dict[str, object] = {
-        "scene": scene,
-        "round": 1,
-        "method": method,
-        "model": "made",
-        "weights_sha256": "",
-        "seed": 0,
-        "captured_views": 4,
-        "generated_views": 0,
-        "gaussians": 10,
-        "generated_gaussians": 0,
-        "psnr_db": psnr_db,
-        "ssim": 0.5,
-        "coverage": 1.0,
-    }
-    return MetricsRow(**{**values, **more})  # type: ignore[arg-type]
+def row(
+    scene: str,
+    method: str,
+    psnr_db: float,
+    *,
+    round_number: int = 1,
+    seed: int = 0,
+    fit: Fit = Fit.PREDICTED,
+    **more: float,
+) -> MetricsRow:
+    return MetricsRow(
+        scene=scene,
+        round=round_number,
+        method=method,
+        model="made",
+        weights_sha256="",
+        seed=seed,
+        fit=fit,
+        values={"gaussians": 10.0, "psnr_captured_db": psnr_db, "ssim_captured": 0.5, **more},
+    )
 
 
 def cells(table: str) -> list[list[str]]:
@@ -37,39 +40,39 @@ def cells(table: str) -> list[list[str]]:
 
 def test_shape_and_means() -> None:
     rows = [
-        row("b", "sceneexpander", 22.0, inserted_psnr_db=18.0, navigation_coverage=0.9),
-        row("a", "sceneexpander", 20.0, inserted_psnr_db=17.0, navigation_coverage=0.8),
-        row("a", "captured", 25.0, navigation_coverage=0.5, fit=Fit.FITTED),
-        row("b", "captured", 26.0, navigation_coverage=0.7, fit=Fit.FITTED),
-        row("a", "backbone", 18.0, inserted_psnr_db=19.0, navigation_coverage=0.8, fit=Fit.FITTED),
-        row("b", "backbone", 19.0, inserted_psnr_db=19.0, navigation_coverage=0.8),
+        row("b", "sceneexpander", 22.0, psnr_inserted_db=18.0, tour_covered=0.9),
+        row("a", "sceneexpander", 20.0, psnr_inserted_db=17.0, tour_covered=0.8),
+        row("a", "captured", 25.0, tour_covered=0.5, fit=Fit.FITTED),
+        row("b", "captured", 26.0, tour_covered=0.7, fit=Fit.FITTED),
+        row("a", "backbone", 18.0, psnr_inserted_db=19.0, tour_covered=0.8, fit=Fit.FITTED),
+        row("b", "backbone", 19.0, psnr_inserted_db=19.0, tour_covered=0.8),
     ]
     header, *lines = cells(comparison_table(rows).csv())
     assert header == [
-        "method", "Gaussians", "cells of 2", "PSNR, stored size ↑", "SSIM, stored size ↑", "insertion PSNR ↑", "coverage ↑",
-        "coverage gained ↑"
+        "method", "Gaussians", "cells of 2", "PSNR, stored size, dB ↑", "SSIM, stored size ↑", "Tour covered, % ↑",
+        "Tour covered, gained, % ↑", "Inserted PSNR, stored size, dB ↑"
     ]  # fmt: skip
     assert lines == [
-        ["before the insertion, captured photos only", "fitted", "2", "25.50", "0.500", "–", "0.600", "–"],
+        ["Captured only", "fitted", "2", "25.50", "0.500", "60.0", "–", "–"],
         [
-            "backbone with the inserted view, unadapted",
+            "made + inserted view",
             "fitted, as predicted",
             "2",
             "18.50",
             "0.500",
+            "80.0",
+            "20.0",
             "19.00",
-            "0.800",
-            "0.200",
         ],
         [
-            "SceneExpander (corrections and Algorithm 1)",
+            "SceneExpander on made",
             "as predicted",
             "2",
             "21.00",
             "0.500",
+            "85.0",
+            "25.0",
             "17.50",
-            "0.850",
-            "0.250",
         ],
     ]
 
@@ -79,32 +82,31 @@ def test_a_method_that_could_not_be_run_has_its_reason_in_the_line() -> None:
     lost = UnavailableRow(scene="a", round=1, method="ttt3r", model="ttt3r", seed=0, reason=reason)
     rows = [row("a", "captured", 25.0), row("b", "captured", 15.0), lost, row("b", "omnivggt", 12.0)]
     header, *lines = cells(comparison_table(rows).csv())
-    assert header == ["method", "Gaussians", "cells of 2", "PSNR, stored size ↑", "SSIM, stored size ↑"]
+    assert header == ["method", "Gaussians", "cells of 2", "PSNR, stored size, dB ↑", "SSIM, stored size ↑"]
     assert lines[1:] == [
-        ["OmniVGGT (pixel-aligned Gaussians)", "as predicted", "1", "12.00 (1/2)", "0.500 (1/2)"],
-        ["TTT3R (pixel-aligned Gaussians)", "–", "0", reason, "–"],
+        ["OmniVGGT, pixel-aligned", "as predicted", "1", "12.00 (1/2)", "0.500 (1/2)"],
+        ["ttt3r, pixel-aligned", "–", "0", reason, "–"],
     ]
     per_scene = cells(scene_table(rows).csv())
-    assert ["a", "1", "0", "TTT3R (pixel-aligned Gaussians)", "–", reason, "–"] in per_scene
-    assert ["b", "1", "0", "TTT3R (pixel-aligned Gaussians)", "–", "missing", "missing"] in per_scene
+    assert ["a", "1", "0", "ttt3r, pixel-aligned", "–", reason, "–"] in per_scene
+    assert ["b", "1", "0", "ttt3r, pixel-aligned", "–", "missing", "missing"] in per_scene
     with pytest.raises(ValueError, match="two rows"):
         comparison_table([lost, lost])
 
 
 def test_repeats_become_a_mean_with_its_spread() -> None:
-    truths = [TruthMetrics(depth_abs_rel=0.1), TruthMetrics(depth_abs_rel=0.2)]
     runs = [
-        row("a", "gaussian_splatting", 20.0, gaussians=11, truth=truths[0], inserted_psnr_db=9.0),
-        row("a", "gaussian_splatting", 22.0, gaussians=12, truth=truths[1]),
+        row("a", "gaussian_splatting", 20.0, gaussians=11, depth_abs_rel=0.1, psnr_inserted_db=9.0),
+        row("a", "gaussian_splatting", 22.0, gaussians=12, depth_abs_rel=0.2),
     ]
     whole = over_repeats(runs)
-    assert (whole.repeats, whole.psnr_db, whole.gaussians) == (2, 21.0, 11)
-    assert whole.spread["psnr_db"] == pytest.approx(2**0.5)
-    assert whole.value("truth.depth_abs_rel") == pytest.approx(0.15)
-    assert whole.spread["truth.depth_abs_rel"] == pytest.approx(0.1 / 2**0.5)
-    assert whole.inserted_psnr_db is None, "one run lacks it"
-    assert "inserted_psnr_db" not in whole.spread
-    assert whole.numbers()["spread_psnr_db"] == pytest.approx(2**0.5)
+    assert (whole.repeats, whole.value("psnr_captured_db"), whole.value("gaussians")) == (2, 21.0, 11)
+    assert whole.spread["psnr_captured_db"] == pytest.approx(2**0.5)
+    assert whole.value("depth_abs_rel") == pytest.approx(0.15)
+    assert whole.spread["depth_abs_rel"] == pytest.approx(0.1 / 2**0.5)
+    assert whole.value("psnr_inserted_db") is None, "one run lacks it"
+    assert "psnr_inserted_db" not in whole.spread
+    assert whole.numbers()["spread_psnr_captured_db"] == pytest.approx(2**0.5)
     assert cells(comparison_table([whole]).csv())[1][3] == "21.00 ± 1.41"
     assert over_repeats(runs[:1]) is runs[0]
     with pytest.raises(ValueError, match="one scene"):
@@ -113,20 +115,20 @@ def test_repeats_become_a_mean_with_its_spread() -> None:
 
 def test_gaps_are_shown_not_averaged_over() -> None:
     rows = [
-        row("a", "captured", 25.0, navigation_coverage=0.5),
+        row("a", "captured", 25.0, tour_covered=0.5),
         row("b", "captured", 15.0),
-        row("a", "sceneexpander", 20.0, navigation_coverage=0.9, truth=TruthMetrics(depth_abs_rel=0.1)),
-        row("c", "backbone", 18.0, navigation_coverage=0.9),
+        row("a", "sceneexpander", 20.0, tour_covered=0.9, depth_abs_rel=0.1),
+        row("c", "backbone", 18.0, tour_covered=0.9),
     ]
     header, *lines = cells(comparison_table(rows).csv())
     table = {line[0].split()[0]: dict(zip(header, line, strict=True)) for line in lines}
-    assert table["before"]["PSNR, stored size ↑"] == "20.00 (2/3)"
-    assert table["before"]["coverage ↑"] == "0.500 (1/3)"
-    assert table["before"]["depth AbsRel ↓"] == "missing"
+    assert table["Captured"]["PSNR, stored size, dB ↑"] == "20.00 (2/3)"
+    assert table["Captured"]["Tour covered, % ↑"] == "50.0 (1/3)"
+    assert table["Captured"]["Depth error, % ↓"] == "missing"
     assert table["SceneExpander"]["cells of 3"] == "1"
-    assert table["SceneExpander"]["depth AbsRel ↓"] == "0.100 (1/3)"
-    assert table["backbone"]["coverage gained ↑"] == "missing"  # nothing to compare with in scene c
-    assert "insertion PSNR ↑" not in header
+    assert table["SceneExpander"]["Depth error, % ↓"] == "10.00 (1/3)"
+    assert table["made"]["Tour covered, gained, % ↑"] == "missing"  # nothing to compare with in scene c
+    assert "Inserted PSNR, stored size, dB ↑" not in header
 
 
 def test_scene_table_lists_absent_combinations() -> None:
@@ -137,7 +139,7 @@ def test_scene_table_lists_absent_combinations() -> None:
 
 
 def test_seeds_and_rounds_are_cells_of_their_own() -> None:
-    rows = [row("a", "captured", 20.0), row("a", "captured", 30.0, seed=1), row("a", "captured", 10.0, round=2)]
+    rows = [row("a", "captured", 20.0), row("a", "captured", 30.0, seed=1), row("a", "captured", 10.0, round_number=2)]
     assert cells(comparison_table(rows).csv())[1][2:4] == ["3", "20.00"]
     with pytest.raises(ValueError, match="two rows"):
         comparison_table([*rows, rows[0]])
@@ -146,7 +148,7 @@ def test_seeds_and_rounds_are_cells_of_their_own() -> None:
 def test_unknown_methods_come_last() -> None:
     rows = [row("a", "zebra", 1.0), row("a", "other", 2.0), row("a", "sceneexpander", 3.0)]
     assert [line[0] for line in cells(comparison_table(rows).csv())[1:]] == [
-        "SceneExpander (corrections and Algorithm 1)",
+        "SceneExpander on made",
         "other",
         "zebra",
     ]
@@ -154,10 +156,10 @@ def test_unknown_methods_come_last() -> None:
 
 def test_markdown() -> None:
     text = comparison_table([row("a", "odd|name", 25.0)]).markdown().splitlines()
-    assert text[1].startswith("| :-- | --: | --: |")
+    assert text[1].startswith("| :-- | :-- | --: |")
     assert text[2].startswith("| odd\\|name | as predicted | 1 | 25.00 |")
 
 
 def test_what_the_scene_before_the_insertion_shows_of_an_inserted_view_is_no_number() -> None:
-    table = comparison_table([row("a", "captured", 25.0, inserted_psnr_db=9.0)])
-    assert "insertion PSNR ↑" not in table.header
+    table = comparison_table([row("a", "captured", 25.0, psnr_inserted_db=9.0)])
+    assert "Inserted PSNR, stored size, dB ↑" not in table.header

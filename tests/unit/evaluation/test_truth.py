@@ -16,11 +16,10 @@ import pytest
 import torch
 from PIL import Image
 
-from sceneexpander.artifacts.metrics import TruthMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError, sha256_of_file
 from sceneexpander.artifacts.views import ViewSet
-from sceneexpander.evaluation.truth import SceneTruth, ViewTruth, against_truth, check_truth, load_truth
+from sceneexpander.evaluation.truth import SceneTruth, TruthMetrics, ViewTruth, against_truth, check_truth, load_truth
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from tests.unit.evaluation.made import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures

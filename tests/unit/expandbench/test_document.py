@@ -57,8 +57,8 @@ def test_what_is_written_by_hand_quotes_no_measured_number() -> None:
 def test_the_results_file_holds_the_cells_again(tmp_path: Path) -> None:
     results().save(tmp_path / "results.json")
     assert Results.load(tmp_path / "results.json") == results()
-    (tmp_path / "results.json").write_text('{"schema": "ablation/1"}')
-    with pytest.raises(UserError, match="ablation/2"):
+    (tmp_path / "results.json").write_text('{"schema": "ablation/2"}')
+    with pytest.raises(UserError, match="ablation/3"):
         Results.load(tmp_path / "results.json")
 
 
@@ -72,7 +72,7 @@ def test_the_gain_is_split_into_corrections_and_adaptation() -> None:
         ("Algorithm 1 on top of the corrections", "-0.25"),
     ):
         (line,) = [line for line in page.splitlines() if line.startswith(f"- {title} (")]
-        assert f"PSNR **{number} ± 0.00** " in line
+        assert f"PSNR **{number} ± 0.00 dB** " in line
         assert "1 development scenes, with the fit" in line or "development scenes, with the fit" in line
     assert page.count("Not measured with this version.") == len(STUDIES) - 1
 

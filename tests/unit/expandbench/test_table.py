@@ -24,14 +24,20 @@ from sceneexpander.expandbench.table import (
     seed_spread,
 )
 
-PSNR = next(column for column in COLUMNS if column.name == "psnr_db")
+PSNR = next(column for column in COLUMNS if column.name == "psnr_captured_db")
 DEPTH = next(column for column in COLUMNS if column.name == "depth_abs_rel")
 NUMBERS = BenchNumbers(
-    own_psnr_db=19.0, own_open_share=0.0,
-    psnr_db=20.0, ssim=0.8, st_lpips=0.01, others_psnr_db=19.0, camera_rotation_deg=0.1, camera_direction_deg=0.2, depth_abs_rel=0.05,
-    inserted_psnr_db=25.0, inserted_rotation_deg=1.0, inserted_direction_deg=2.0, new_psnr_db=15.0, new_coverage=0.9,
-    new_depth_abs_rel=0.2, between_psnr_db=17.0,
+    values={
+        "psnr_at_photo_size_db": 19.0, "seen_through_at_photo_size": 0.0, "psnr_captured_db": 20.0, "ssim_captured": 0.8,
+        "st_lpips_captured": 0.01, "psnr_from_others_db": 19.0, "camera_rotation_deg": 0.1, "camera_direction_deg": 0.2,
+        "depth_abs_rel": 0.05, "psnr_inserted_db": 25.0, "inserted_rotation_deg": 1.0, "inserted_direction_deg": 2.0,
+        "psnr_new_region_db": 15.0, "new_region_drawn": 0.9, "new_region_drawn_abs_rel": 0.2, "psnr_half_way_db": 17.0,
+    }
 )  # fmt: skip
+
+
+def changed(numbers: BenchNumbers, **values: float) -> BenchNumbers:
+    return BenchNumbers(values={**numbers.values, **values})
 
 
 def cell(
@@ -39,7 +45,7 @@ def cell(
 ) -> CellResult:
     return CellResult(
         scene=scene, grade=grade, row=row, seed=seed, steps=0, seconds=0.0, code="c",
-        numbers=replace(NUMBERS, psnr_db=psnr, own_psnr_db=psnr, depth_abs_rel=depth),
+        numbers=changed(NUMBERS, psnr_captured_db=psnr, psnr_at_photo_size_db=psnr, depth_abs_rel=depth),
     )  # fmt: skip
 
 
@@ -70,8 +76,8 @@ def test_means_and_spread_over_seeds() -> None:
 
 
 def test_a_mean_with_a_gap_is_no_mean() -> None:
-    gap = replace(CELLS[4], numbers=replace(NUMBERS, others_psnr_db=None))
-    column = next(c for c in COLUMNS if c.name == "others_psnr_db")
+    gap = replace(CELLS[4], numbers=BenchNumbers(values={"psnr_captured_db": 20.0}))
+    column = next(c for c in COLUMNS if c.name == "psnr_from_others_db")
     assert mean_of([gap, CELLS[5]], column) is None
     assert mean_of([], column) is None
 
@@ -94,7 +100,12 @@ def test_differences_are_paired_by_scene_and_grade() -> None:
 def test_a_component_is_compared_with_the_row_that_lacks_it_unless_it_cannot_show() -> None:
     cells = [
         *CELLS,
-        *(replace(c, row="more", numbers=replace(c.numbers, psnr_db=c.numbers.psnr_db + 0.3)) for c in CELLS[4:8]),
+        *(
+            replace(
+                c, row="more", numbers=changed(c.numbers, psnr_captured_db=c.numbers.values["psnr_captured_db"] + 0.3)
+            )
+            for c in CELLS[4:8]
+        ),
     ]
     references = {"full": BASELINE, "more": "full", "absent": "full"}
     lines = components_table(cells, references, {}, [PSNR]).splitlines()
@@ -118,7 +129,7 @@ def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
     assert found.mean == pytest.approx(0.0)
     assert found.lowest == pytest.approx(0.01)
     assert found.better == 1
-    smaller = [replace(c, numbers=replace(c.numbers, depth_abs_rel=0.03)) if c.row == "full" else c for c in CELLS]
+    smaller = [replace(c, numbers=changed(c.numbers, depth_abs_rel=0.03)) if c.row == "full" else c for c in CELLS]
     found = paired(smaller, "full", DEPTH)
     assert found is not None
     assert (found.better, found.scenes) == (2, 2)
@@ -126,8 +137,8 @@ def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
 
 def test_the_tables_say_so() -> None:
     text = main_table(CELLS)
-    assert "| full | 4 | 21.70 ± 0.35 | 0.000 ± 0.000 | 21.70 ± 0.35 |" in text
-    assert "| captured | 4 | 22.10 ± 0.14 | 0.000 ± 0.000 | 22.10 ± 0.14 |" in text
+    assert "| full | 4 | 21.70 ± 0.35 | 0.0 ± 0.0 | 21.70 ± 0.35 |" in text
+    assert "| captured | 4 | 22.10 ± 0.14 | 0.0 ± 0.0 | 22.10 ± 0.14 |" in text
     curve = curve_table(CELLS, ["full"])
     assert "| mixed_1 | -0.90 ± 0.14 (worst -0.90; 0/2) | +0.50 ± 0.07 (worst -0.30; 1/2) |" in curve
 

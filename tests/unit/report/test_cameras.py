@@ -12,7 +12,6 @@ import torch
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
 from sceneexpander.artifacts.metrics import ViewMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.store import to_plain
 from sceneexpander.report import SceneSource, collect_scene, write_page
 from sceneexpander.report.cameras import camera_lines, cameras_shown, gathered_cameras
 from sceneexpander.tracking import scene_runs
@@ -109,7 +108,7 @@ def test_a_card_tells_what_is_special_about_its_view(tmp_path: Path, changes: di
     report = CameraReport(views=(replace(FINE, **changes), *others), notes=())  # type: ignore[arg-type]
     facts = gathered_cameras(saved(tmp_path / "cameras", report))
     assert facts is not None
-    shown = cameras_shown(to_plain(facts), {})
+    shown = cameras_shown(facts, {})
     assert shown is not None
     assert wanted in (*shown.cards[0].facts, *shown.cards[0].doubts)
     assert shown.cards[1].facts == ("120 points, 0.5 px off",)
@@ -154,9 +153,7 @@ def test_means_say_how_many_views_they_are_over_and_lost_views_stand_apart(
     tmp_path: Path,
 ) -> None:
     def view(name: str, *, posed: bool, psnr: float) -> ViewMetrics:
-        return ViewMetrics(
-            view_id=name, generated=False, posed=posed, psnr_db=psnr, ssim=0.5, coverage=1.0, generated_share=0.0
-        )
+        return ViewMetrics(view_id=name, generated=False, posed=posed, values={"psnr_captured_db": psnr})
 
     views = (view("v0", posed=True, psnr=20.0), view("v1", posed=False, psnr=35.5))
     methods = []
@@ -167,7 +164,9 @@ def test_means_say_how_many_views_they_are_over_and_lost_views_stand_apart(
         made = Reconstruction.load(method.reconstruction)
         posed = torch.tensor([name != "v1" for name in made.view_ids])
         replace(made, posed=posed).save(tmp_path / method.name)
-        replace(row(method.name, 20.0), views=views, captured_views_posed=1).save(tmp_path / f"{method.name}.json")
+        one = row(method.name, 20.0)
+        values = {**one.values, "views_captured_posed": 1.0}
+        replace(one, views=views, values=values).save(tmp_path / f"{method.name}.json")
         methods.append(replace(method, reconstruction=tmp_path / method.name, metrics=tmp_path / f"{method.name}.json"))
     (tmp_path / "room").mkdir()
     collect_scene(replace(source, rounds=[replace(source.rounds[0], methods=methods)]), tmp_path / "room")

@@ -15,7 +15,8 @@ from PIL import Image
 from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.adaptation.observe import Look
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
-from sceneexpander.artifacts.metrics import Fit, MetricsRow, SizeMetrics, UnavailableRow
+from sceneexpander.artifacts.metrics import Fit, MetricsRow, UnavailableRow
+from sceneexpander.artifacts.page import Refinement, ScenePage
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.source_type import read_source_type
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
@@ -27,7 +28,7 @@ from sceneexpander.rendering.produce import produce_renders
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene, write_page
 from sceneexpander.report.course import fits
 from sceneexpander.report.curve import Curve, curve_chart, objective_curves
-from sceneexpander.report.words import TABLES
+from sceneexpander.report.words import number_tables
 from sceneexpander.tracking import scene_runs
 from sceneexpander.viewer.packed import pack_splats
 from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
@@ -78,6 +79,16 @@ def save_looks(folder: Path, looks: list[Look], warnings: list[str]) -> None:
 
 
 def row(method: str, psnr: float) -> MetricsRow:
+    captured = {
+        "views_captured": 2.0,
+        "gaussians": 10.0,
+        "psnr_captured_db": psnr,
+        "ssim_captured": 0.5,
+        "psnr_at_photo_size_db": psnr - 1,
+        "ssim_at_photo_size": 0.4,
+        "seen_through_at_photo_size": 0.25,
+    }
+    inserted = {"views_generated": 1.0, "psnr_inserted_db": psnr / 2, "psnr_at_picture_size_db": psnr / 2 - 1}
     return MetricsRow(
         scene="room",
         round=1,
@@ -85,16 +96,7 @@ def row(method: str, psnr: float) -> MetricsRow:
         model="mini",
         weights_sha256="2" * 64,
         seed=0,
-        captured_views=2,
-        generated_views=int(method != "captured"),
-        gaussians=10,
-        generated_gaussians=0,
-        psnr_db=psnr,
-        ssim=0.5,
-        coverage=1.0,
-        inserted_psnr_db=None if method == "captured" else psnr / 2,
-        own=SizeMetrics(open_share=0.25, psnr_db=psnr - 1, ssim=0.4),
-        inserted_own=None if method == "captured" else SizeMetrics(open_share=0.25, psnr_db=psnr / 2 - 1),
+        values=captured | ({} if method == "captured" else inserted),
     )
 
 
@@ -169,13 +171,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
                 statistics=folder / "stats",
             )
         ],
-        config={
-            "seed": 0,
-            "device": "cpu",
-            "model": {"weights": "builtin"},
-            "adapt": {"steps": 3},
-            "refine": {"visits": 2},
-        },
+        settings={"seed": "0", "device": "cpu", "model.weights": "builtin", "adapt.steps": "3", "refine.visits": "2"},
         overrides=["profile=smoke"],
     )
 
@@ -240,9 +236,9 @@ def test_it_says_what_rows_and_columns_mean_and_what_went_wrong(page: Path) -> N
     assert "ceiling" not in html, "fitted Gaussians show the photos better than the scene before the insertion"
     shown = [
         item
-        for _, table in TABLES
+        for _, table in number_tables()
         for item in table
-        if item.name in {"psnr_db", "own.psnr_db", "own.open_share", "inserted_psnr_db"}
+        if item.name in {"psnr_captured_db", "psnr_at_photo_size_db", "seen_through_at_photo_size", "psnr_inserted_db"}
     ]
     assert len(shown) == 4
     for item in shown:
@@ -280,7 +276,8 @@ def test_bold_and_names_tell_fitted_rows_from_others(gathered: Path, tmp_path: P
     shutil.copytree(gathered, folder)
     for name, value, fit in (("backbone", 21.0, Fit.PREDICTED), ("sceneexpander", 27.0, Fit.FITTED)):
         path = folder / "round_1" / name / "metrics.json"
-        replace(MetricsRow.load(path), psnr_db=value, fit=fit).save(path)
+        one = MetricsRow.load(path)
+        replace(one, values={**one.values, "psnr_captured_db": value}, fit=fit).save(path)
     (tmp_path / "report").mkdir()
     write_page([folder], tmp_path / "report")
     html = (tmp_path / "report" / "index.html").read_text()
@@ -371,11 +368,12 @@ def test_without_looks_the_page_is_silent_about_them(source: SceneSource, tmp_pa
     assert not (tmp_path / "room" / "round_1" / "looks").exists()
 
 
-def test_a_fit_of_the_gaussians_says_what_it_changed(page: Path) -> None:
+def test_a_fit_of_the_gaussians_says_what_it_changed(page: Path, gathered: Path) -> None:
     lines = re.findall(r"Gaussians of [^<]*", page.read_text())
     assert lines == ["Gaussians of Captured only: photometric loss 0.0820 to 0.0312 in 80 steps"], "the others had none"
     assert page.read_text().count("those of pictures it was fitted to") == 1
-    useless = {"name": "captured", "model": "mini", "refinement": {"steps": 4, "before": 0.08, "after": 0.09}}
+    (method, *_) = ScenePage.load(gathered).rounds[0].methods
+    useless = replace(method, refinement=Refinement(steps=4, before=0.08, after=0.09))
     assert "kept as they were" in fits([useless])[0]
 
 
@@ -402,11 +400,11 @@ def test_runs_to_track_come_from_the_same_folder(gathered: Path, tmp_path: Path)
     assert set(runs) == set(METHODS)
     assert len({run.key for run in (*runs.values(), lacking)}) == 4
     adapted = runs["sceneexpander"]
-    assert adapted.curves["5_look/psnr_captured_db"] == [(0, 22.25), (40, 21.5)]
+    assert adapted.curves["5_look/captured_psnr"] == [(0, 22.25), (40, 21.5)]
     assert len([place for place in adapted.artefacts if place.startswith("looks/")]) == 6
-    assert adapted.curves["4_loss/objective_without_inserted"] == [(1, 2.0), (3, 2.0 / 3)]
-    assert adapted.curves["4_loss/objective_with_inserted"] == [(2, 1.0)]
-    assert adapted.curves["4_loss/inserted_depth"] == [(2, 0.5)], "zero is no loss where there is nothing to lose"
+    assert adapted.curves["4_loss/loss_without_inserted"] == [(1, 2.0), (3, 2.0 / 3)]
+    assert adapted.curves["4_loss/loss_with_inserted"] == [(2, 1.0)]
+    assert adapted.curves["4_loss/gen_depth"] == [(2, 0.5)], "zero is no loss where there is nothing to lose"
     assert not runs["backbone"].curves
     assert adapted.metrics["1_quality/psnr_captured_db"] == 22.0
     assert "PSNR **21.00 dB**; Inserted PSNR **10.00 dB**." in adapted.tags["mlflow.note.content"]
@@ -464,7 +462,7 @@ def test_steps_with_and_without_the_inserted_view_are_curves_of_their_own(
     inserted: list[bool], wanted: dict[str, list[int]]
 ) -> None:
     lost = float("nan") if inserted == [True, False, True, True] else 3.0
-    curves = objective_curves({"loss": [1.0, 2.0, lost, 4.0], "inserted": inserted})
+    curves = objective_curves(inserted, [1.0, 2.0, lost, 4.0])
     assert {curve.name: [step for step, _ in curve.points] for curve in curves} == wanted
     chart = curve_chart(curves, 4)
     assert chart.count("<polyline") == len(wanted)
@@ -484,7 +482,7 @@ def test_curves_share_their_axes() -> None:
 
 
 def test_a_curve_of_nothing_is_nothing() -> None:
-    assert objective_curves({}) == []
-    assert objective_curves({"loss": [float("nan")], "inserted": [True]}) == []
+    assert objective_curves([], []) == []
+    assert objective_curves([True], [float("nan")]) == []
     assert curve_chart([], 3) == ""
-    assert "polyline" in curve_chart(objective_curves({"loss": [1.0, 1.0], "inserted": [True, True]}), 2)
+    assert "polyline" in curve_chart(objective_curves([True, True], [1.0, 1.0]), 2)

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander.artifacts.quantities import TABLE, Group
+from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
+from sceneexpander.catalogue import Group, measured_metrics
+from sceneexpander.catalogue.course import COURSE
 from sceneexpander.tracking import TrackingConfig, record_runs
-from sceneexpander.tracking.describe import NOTE_TAG, VIEWS, experiment_links, experiment_note, run_note
+from sceneexpander.tracking.describe import NOTE_TAG, experiment_links, experiment_note, run_note, saved_views
 from sceneexpander.tracking.store import NAMES, database_path, describe_experiments, last_experiment
 from tests.unit.tracking.test_store import CONFIG, client, record, runs
 
@@ -26,15 +28,15 @@ def test_an_experiment_describes_itself_and_has_views_of_its_table(root: Path) -
     assert found[NOTE_TAG] == experiment_note()
     for group in Group:
         assert f"`{group}`" in found[NOTE_TAG]
-    known = {item.tracked for item in TABLE}
-    for view in VIEWS:
+    known = {item.tracked for item in (*measured_metrics(), *COURSE)}
+    for view in saved_views():
         saved = json.loads(found[f"mlflow.sharedViewState.{view.key}"])
         assert saved["name"] == view.name
         columns = json.loads(saved["state"])["selectedColumns"]
         metrics = [column.split("`")[1] for column in columns if column.startswith("metrics.")]
         assert metrics
         assert set(metrics) <= known
-    made = [json.loads(found[f"mlflow.sharedViewState.{view.key}"])["createdAt"] for view in VIEWS]
+    made = [json.loads(found[f"mlflow.sharedViewState.{view.key}"])["createdAt"] for view in saved_views()]
     assert made == sorted(made, reverse=True), "the menu shows the newest first"
     assert max(map(len, found.values())) < 5000
 
@@ -42,7 +44,7 @@ def test_an_experiment_describes_itself_and_has_views_of_its_table(root: Path) -
 def test_the_links_open_a_view_that_there_is() -> None:
     links = experiment_links("http://127.0.0.1:5000", "7")
     assert links["numbers"].startswith("http://127.0.0.1:5000/#/experiments/7/runs?")
-    assert links["numbers"].rpartition("=")[2] in {view.key for view in VIEWS}
+    assert links["numbers"].rpartition("=")[2] in {view.key for view in saved_views()}
     assert set(links) == {"numbers", "charts", "pictures"}
 
 
@@ -65,7 +67,7 @@ def test_a_store_from_before_gets_its_views(root: Path) -> None:
     with sqlite3.connect(database_path(root)) as database:
         database.execute("DELETE FROM experiment_tags")
     describe_experiments(TrackingConfig(), root)
-    assert f"mlflow.sharedViewState.{VIEWS[0].key}" in tags(root)
+    assert f"mlflow.sharedViewState.{saved_views()[0].key}" in tags(root)
     assert NOTE_TAG not in client(root).get_experiment("0").tags, "MLflow's own is left alone"
 
 
@@ -103,7 +105,12 @@ def test_runs_with_the_names_of_an_earlier_version_are_recorded_again(root: Path
 
 
 def test_a_run_says_what_it_is_in_what_fits_into_a_tag() -> None:
-    cameras = {"summary": "1 of 2 photos used", "problems": ["b.jpg: left out, " + "x" * 6000]}
+    used = ViewCamera(
+        view_id="a", name="a.jpg", generated=False, posed=True, rough=False, reason="", warnings=(), focal_ratio=0.8,
+        focal_source="exif", distortion=(0.0, 0.0), inliers=20, error_px=None,
+    )  # fmt: skip
+    lost = replace(used, view_id="b", name="b.jpg", posed=False, reason="x" * 6000)
+    cameras = CameraReport(views=(used, lost), notes=())
     note = run_note("Behind the\n# table", "captured", None, cameras, ["is blurred"])
     assert note.startswith("> Behind the # table\n"), "a sentence stays a sentence"
     assert "1 of 2 photos used" in note

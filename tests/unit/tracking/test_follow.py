@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from sceneexpander.artifacts.live import LOG_NAME, LiveLog, read_live
+from sceneexpander.artifacts.live import LOG_NAME, LiveLog, LiveRun, LiveStep, read_live
 from sceneexpander.tracking import record_runs
 from sceneexpander.tracking.follow import STALE_S, Follower
 from sceneexpander.tracking.store import LIVE_TAG, NAMES
 from tests.unit.tracking.test_store import CONFIG, client, record, runs
 
 FACTS = {"scene": "room", "round": 1, "steps": 3, "sections": {"adapt": {"steps": 3}}}
-OBJECTIVE, LOOKED = "4_loss/objective_with_inserted", "5_look/psnr_captured_db"
+OBJECTIVE, LOOKED = "4_loss/loss_with_inserted", "5_look/captured_psnr"
 LOOK = {"step": 0, "captured_psnr": 20.0, "inserted_psnr": 15.5, "drift": {"network.trunk": 0.25}}
 
 
@@ -39,7 +39,7 @@ def test_a_log_is_readable_at_any_moment(tmp_path: Path) -> None:
     log.write("step", _step(1))
     with (tmp_path / LOG_NAME).open("a") as file:
         file.write('{"kind": "step", "st')  # as a killed run leaves it
-    assert [line["kind"] for line in read_live(tmp_path)] == ["run", "step"]
+    assert [type(line) for line in read_live(tmp_path)] == [LiveRun, LiveStep]
 
 
 def test_a_running_adaptation_shows_and_is_finished(root: Path) -> None:

@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
+from sceneexpander.artifacts.page import flatten
 from sceneexpander.errors import UserError
-from sceneexpander.tracking import RunRecord, TrackingConfig, flatten, record_runs, run_key
+from sceneexpander.tracking import RunRecord, TrackingConfig, record_runs, run_key
 from sceneexpander.tracking.store import (
     COMPLETE_TAG,
     database_path,
@@ -34,7 +35,7 @@ def record(folder: Path, key: str) -> RunRecord:
         name=f"run {key}",
         params={"adapt.steps": "4", "prompt": "x" * 7000},
         metrics={"psnr_db": 20.5},
-        curves={"4_loss/objective_with_inserted": [(1, 3.0), (2, 2.0), (5, 1.0)]},
+        curves={"4_loss/loss_with_inserted": [(1, 3.0), (2, 2.0), (5, 1.0)]},
         artefacts={"pictures/picture.txt": picture},
         tags={"scene": "room"},
         started_ms=1_700_000_000_000,
@@ -62,7 +63,7 @@ def test_a_run_is_whole(root: Path) -> None:
     assert run.data.tags["scene"] == "room"
     assert run.info.status == "FINISHED"
     assert run.info.start_time == 1_700_000_000_000
-    history = client(root).get_metric_history(run.info.run_id, "4_loss/objective_with_inserted")
+    history = client(root).get_metric_history(run.info.run_id, "4_loss/loss_with_inserted")
     assert [(point.step, point.value) for point in history] == [(1, 3.0), (2, 2.0), (5, 1.0)]
     assert [item.path for item in client(root).list_artifacts(run.info.run_id, "pictures")] == ["pictures/picture.txt"]
     assert run.info.artifact_uri.startswith((root / "mlflow" / "artifacts").as_uri())
