@@ -172,7 +172,7 @@ def _explained_share(
         ]
         noise = _AGREE_PX * setup.unit_px / float(np.sqrt(intrinsics[a, 0, 0] * intrinsics[b, 0, 0]))
         cv2.setRNGSeed(setup.seed)
-        essential, inliers = cv2.findEssentialMat(*rays, np.eye(3), cv2.RANSAC, 0.999, noise)
+        essential, inliers = cv2.findEssentialMat(rays[0], rays[1], np.eye(3), cv2.RANSAC, 0.999, noise)
         if essential is not None and essential.shape == (3, 3):
             explained += int(inliers.sum())
         count += pair.verified.count

@@ -44,7 +44,7 @@ def make_known_cameras(
         intrinsics_px=intrinsics,
         depth=depth,
         metric=metric and (poses is not None or depth is not None),
-        capture_from_world=None if not posed else tuple(tuple(map(float, row)) for row in posed[0].tolist()),
+        capture_from_world=None if not posed else tuple((row[0], row[1], row[2], row[3]) for row in posed[0].tolist()),
     )
 
 
