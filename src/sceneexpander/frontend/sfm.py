@@ -22,6 +22,7 @@ from sceneexpander.frontend.appearance import find_overlay, group_alike, looks_m
 from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
 from sceneexpander.frontend.features import Features, lie_in
+from sceneexpander.frontend.known_check import compare_with_matches
 from sceneexpander.frontend.lens_tests import find_distortion, rival_lens_deg
 from sceneexpander.frontend.lenses import LensPlan, ViewOptics
 from sceneexpander.frontend.mapping import Mapping
@@ -122,6 +123,18 @@ def estimate_cameras(
         features = [own.select(lie_in(mask, own.pixel_xy)) for own, mask in zip(features, setup.shown, strict=True)]
         described = _match_descriptors(features, config, memory)
         pairs = _match_all(features, described, None, config, setup)
+    contradictions = compare_with_matches(features, pairs, known, config, setup)
+    for note in contradictions.notes:
+        _log.warning("%s", note)
+    if contradictions.intrinsics or contradictions.poses.any():
+        # Poses that are left are still given, now in the company of views whose camera is estimated.
+        known = replace(
+            known,
+            posed=known.posed & ~contradictions.poses.numpy(),
+            intrinsics=None if contradictions.intrinsics else known.intrinsics,
+        )
+        plan = LensPlan.make(config, setup, known, own, focal_hint_px)
+    setup = replace(setup, remarks=contradictions.notes)
     model = _model(features, described, None, known, plan, config, setup, pairs=pairs)
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
     if choosing and judge is not None and not known.posed.all():
@@ -245,7 +258,7 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
 
 def _notes(model: _Model, setup: Setup) -> tuple[str, ...]:
     """What matches say about the set as a whole."""
-    notes = []
+    notes = [*setup.remarks]
     if setup.overlay:
         notes.append("all photos have the same text, logo or watermark at one place: it is not looked at")
     for views in group_alike(model.features, model.pairs, setup.unit_px):
