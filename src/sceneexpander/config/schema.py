@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from sceneexpander.adaptation.config import AdaptConfig
-from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import ChoiceConfig, GeneratorConfig
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
-from sceneexpander.optimisation.config import OptimiseConfig, RefineConfig
+from sceneexpander.insertion.config import CorrectionsConfig
+from sceneexpander.optimisation.config import OptimiseConfig
+from sceneexpander.photometric.config import RefineConfig, WarmupConfig
 from sceneexpander.ranges import Range, check_ranges
 from sceneexpander.reconstruction.loaded import ModelConfig
 from sceneexpander.rendering import RenderConfig
@@ -38,6 +39,7 @@ class ProjectConfig:
     frontend: FrontendConfig
     warmup: WarmupConfig
     adapt: AdaptConfig
+    corrections: CorrectionsConfig
     refine: RefineConfig
     rivals: RivalsConfig
     optimise: OptimiseConfig

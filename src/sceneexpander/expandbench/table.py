@@ -6,9 +6,9 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.expandbench.measure import BenchNumbers
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
+from sceneexpander.insertion.acceptance import Acceptance
 
 Number = Callable[[BenchNumbers], float | None]
 
