@@ -123,7 +123,7 @@ def test_test_scenes_are_others_and_only_the_study_of_that_name_uses_them() -> N
 
 
 def test_an_old_name_says_the_new_one() -> None:
-    with pytest.raises(UserError, match="'corrected'"):
+    with pytest.raises(UserError, match="ablation=corrected"):
         make_plan(ROOT, ["control_no_adaptation"], ["room_1"], ["clean"], ["0"], [])
     plan, _ = make_plan(ROOT, ["default"], ["test"], ["clean"], ["0"], [])
     assert plan.scenes == TEST

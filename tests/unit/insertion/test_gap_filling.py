@@ -10,6 +10,7 @@ import torch
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import pixel_centres
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
+from sceneexpander.insertion.gap_filling import close_gaps
 from sceneexpander.models.pixel_aligned import pixel_aligned
 from sceneexpander.splatting import render
 
