@@ -14,7 +14,7 @@ from sceneexpander.insertion.contradiction import Contradiction
 from sceneexpander.insertion.gap_filling import GapFilling
 from sceneexpander.insertion.head import GaussianHead
 from sceneexpander.insertion.protocol import Correction
-from sceneexpander.typed import decode_dataclass
+from sceneexpander.typed import DecodeError, decode_dataclass
 
 ENTRY_POINTS = "sceneexpander.corrections"  # where other packages name theirs
 
@@ -55,7 +55,10 @@ def _made(sections: Mapping[str, Mapping[str, Any]]) -> list[Correction]:
                 did_you_mean(name, brought) if brought else f"none brings any: they are entry points of {ENTRY_POINTS}"
             )
             raise UserError(f"no installed package brings a correction {name!r}", where="others", fix=fix)
-        correction = decode_dataclass(brought[name].load(), settings, where=f"others.{name}")
+        try:
+            correction = decode_dataclass(brought[name].load(), settings, where=name)
+        except DecodeError as error:
+            raise UserError(f"{error.where} {error.problem}", where="others", fix=error.fix) from None
         if not isinstance(correction, Correction):
             raise UserError(f"{name} has no method of a correction", where="others", fix="see insertion/protocol.py")
         made.append(correction)
