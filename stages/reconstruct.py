@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
-from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.photometric.config import WarmupConfig
 from sceneexpander.progress import progress_bar
 from sceneexpander.reconstruction.cameras import report_cameras
 from sceneexpander.reconstruction.initial import initial_state
@@ -62,7 +62,7 @@ def main(cell: Cell) -> None:
             "model": loaded.model.name,
             "weights_sha256": loaded.weights_sha256,
             "licence": loaded.licence,
-            "warmup": None if warmup is None else asdict(warmup),
+            "warmup": None if warmup is None else asdict(warmup) | {"accepted": warmup.accepted},
             "sparse_points": None if sparse is None else int(sparse.sparse.points_world.shape[0]),
         }
         write_json_atomic(folder / "report.json", facts)

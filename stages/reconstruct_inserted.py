@@ -9,9 +9,9 @@ from sceneexpander.artifacts.state import ExpansionState, save_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.photometric.config import RefineConfig
+from sceneexpander.photometric.fitting import fit_to_views
 from sceneexpander.reconstruction.cameras import report_cameras
-from sceneexpander.reconstruction.fitting import fitted
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
 from sceneexpander.reconstruction.memory import load_memory
 from sceneexpander.reconstruction.views import joint_reconstruction
@@ -48,7 +48,7 @@ def main(cell: Cell) -> None:
         seed=sections.seed,
         memory=load_memory(layout.match_memory(cell.scene)),
     )
-    reconstruction, fit = fitted(
+    reconstruction, fit = fit_to_views(
         reconstruction,
         state.views.append(inserted.view),
         sections.refine,
