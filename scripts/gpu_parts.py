@@ -311,7 +311,7 @@ def check_options(setting: Setting) -> None:
         "checkpoint_activations": _Variant(config=with_engine(checkpoint_activations=True), exact=True),
         "views_per_chunk": _Variant(config=with_engine(views_per_chunk=1)),
         "moments int8": _Variant(config=with_engine(moments=MomentsForm.INT8), loss=0.02),
-        "bf16": _Variant(config=replace(plain, precision=Precision.BF16), loss=0.05),
+        "bf16": _Variant(config=replace(plain, precision=Precision.BF16), loss=0.2),
         "compile": _Variant(config=with_engine(compile=True), loss=0.01),
     }
     model = random_model(size, setting.device)
@@ -636,7 +636,8 @@ def check_pipeline(setting: Setting) -> None:
         stats = read_json(path)
         seconds = float(stats["wall_s"])
         total += seconds
-        setting.log.add(f"{path.stem}", round(seconds, 1), "s")
+        memory = f", {stats['peak_gpu_mb']} MB of the GPU" if "peak_gpu_mb" in stats else ""
+        setting.log.add(path.stem, round(seconds, 1), f"s{memory}")
     setting.log.add("stages together", round(total, 1), "s")
     for path in sorted((folder / "outputs").rglob("metrics/*.json")):
         decibel = read_json(path).get("values", {}).get("psnr_captured_db")

@@ -161,8 +161,8 @@ def setting_in(folder: Path, part: str) -> gpu_parts.Setting:
     )
 
 
-# The pipeline has a test of its own, below tests/pipeline; options=gpu are the others' without what they add.
-ELSEWHERE = (GSPLAT_BUILD, "pipeline", "adapt_plain")
+# Those that take longest are run below tests/pipeline.
+ELSEWHERE = (GSPLAT_BUILD, "options", "adapt_paper", "adapt_plain", "pipeline")
 
 
 @pytest.mark.parametrize("part", [name for name in gpu_parts.PARTS if name not in ELSEWHERE])
