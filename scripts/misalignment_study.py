@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from sceneexpander.expansion.rounds import RoundInputs
 
 from sceneexpander.artifacts.views import to_uint8
 from sceneexpander.config.compose import compose
@@ -24,6 +23,7 @@ from sceneexpander.expandbench import BenchScene, build_scene, measure, prepare_
 from sceneexpander.expandbench.grades import Grade, grade_named
 from sceneexpander.expandbench.prepared import PreparedScene, prepare_scene
 from sceneexpander.expansion import correct_round, load_model, refined_round
+from sceneexpander.expansion.rounds import RoundInputs
 from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.misalignment import Misaligned, report_misalignment
