@@ -409,7 +409,7 @@ def check_resume(setting: Setting) -> None:
     size, views, side, steps = ("smallest", 3, 28, 4) if setting.smoke else ("tiny", 9, 224, 12)
     folder = setting.folder / "resume-point"
     # The child first: a process that uses CUDA must not be forked.
-    context = multiprocessing.get_context("spawn" if setting.timed else "fork")
+    context = multiprocessing.get_context("spawn") if setting.timed else multiprocessing.get_context("fork")
     reader, writer = context.Pipe(duplex=False)
     arguments = (size, views, side, steps, str(setting.device), folder, writer)
     child = context.Process(target=_adapt, args=arguments)
@@ -519,8 +519,13 @@ def _drawn(scene: Scene, device: torch.device, backend: Backend, *, antialiased:
     """A picture of a made scene and the gradients of its loss, on the host."""
     leaves = [leaf.detach().to(device).requires_grad_() for leaf in scene.leaves()]
     screen = torch.zeros(1, len(leaves[0]), 2, device=device, requires_grad=True)
+    means, quats, scales, opacities, colours = leaves
     out = rasterise(
-        *leaves,
+        means,
+        quats,
+        scales,
+        opacities,
+        colours,
         scene.viewmat[None].to(device),
         scene.intrinsics[None].to(device),
         scene.height,
@@ -530,7 +535,7 @@ def _drawn(scene: Scene, device: torch.device, backend: Backend, *, antialiased:
     )
     if out.depth is None:
         raise RuntimeError("no depth was drawn")
-    (out.rgb.movedim(1, -1)[0] * scene.target.to(device)).mean().backward()  # type: ignore[no-untyped-call]
+    (out.rgb.movedim(1, -1)[0] * scene.target.to(device)).mean().backward()
     values = {"rgb": out.rgb, "alpha": out.alpha, "depth": torch.where(out.alpha > 0.5, out.depth, 0)}
     for name, leaf in zip(
         ("means", "quats", "scales", "opacities", "colours", "screen"), [*leaves, screen], strict=True
