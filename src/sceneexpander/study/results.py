@@ -12,8 +12,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from sceneexpander.artifacts.store import to_plain, write_bytes_atomic, write_json_atomic
+from sceneexpander.catalogue import Table
 from sceneexpander.errors import UserError
-from sceneexpander.evaluation.table import Table
 from sceneexpander.study.document import ANSWERS_NAME, Participant, Study
 from sceneexpander.study.spec import LETTERS, Criterion
 from sceneexpander.study.statistics import (
