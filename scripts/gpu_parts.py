@@ -45,6 +45,7 @@ from sceneexpander.optimisation.optimise import optimise
 from sceneexpander.plan import Question, request_of
 from sceneexpander.planning import Meter, PlanRequest, adaptation_cost, inference_cost
 from sceneexpander.planning.simulate import AllHeads
+from sceneexpander.processes import end_with_parent
 from sceneexpander.selection import Selection
 from sceneexpander.splatting import RasterSettings, rasterise
 from sceneexpander.splatting.settings import Backend
@@ -742,6 +743,7 @@ def main() -> None:
     parser.add_argument("seconds", type=float)
     parser.add_argument("--smoke", action="store_true")
     given = parser.parse_args()
+    end_with_parent()  # its session is its own, so no signal to the check's terminal reaches it
     device = torch.device(given.device)
     if device.type == "cuda":
         # Compiled for this GPU alone, gsplat is there sooner.
