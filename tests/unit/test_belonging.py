@@ -36,6 +36,7 @@ SECTIONS = (
     "generator",
     "choose",
     "adapt",
+    "corrections",
     "refine",
     "optimise",
     "render",
