@@ -205,6 +205,7 @@ def test_a_setting_reruns_only_what_reads_it(finished: Project) -> None:
         "resolve@room",
         "correct@room-round0",
         "adapt@room-round0",
+        "judge@room-round0",
         "optimise@room-round0-sceneexpander",
         "collect@room",
         "report",
