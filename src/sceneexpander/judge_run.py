@@ -49,7 +49,7 @@ def make_parser() -> CommandParser:
         "judge",
         __doc__.partition("\n")[2],
         examples=[
-            "runs/terrace --dry-run --sheets /tmp/sheets",
+            "runs/terrace --dry-run --sheets sheets",
             "runs/terrace judge.chat.base_url=http://127.0.0.1:8000/v1 judge.chat.key_variable=null judge.chat.model=qwen3-vl-8b",
         ],
     )

@@ -347,7 +347,7 @@ def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_pa
         "pack-sceneexpander",
         "evaluate-sceneexpander",
     }
-    assert fresh == {"adapt", "correct-corrected"} | made_from_it
+    assert fresh == {"adapt", "correct-corrected", "judge"} | made_from_it
 
 
 def test_rivals_are_rows_like_any_other_and_say_so_when_they_cannot_be(finished: Project, tmp_path: Path) -> None:
@@ -384,7 +384,7 @@ def test_rivals_are_rows_like_any_other_and_say_so_when_they_cannot_be(finished:
         params.write_text(before)
         finished.repro()
     remade = {name.partition("@")[0] for name in executed if not any(row in name for row in rows)}
-    assert remade == {"resolve", "collect", "report", "track"}, executed
+    assert remade == {"resolve", "judge", "collect", "report", "track"}, executed
     assert again == []
     assert numbers["ttt3r"] == {"unavailable": "needs the public checkpoint"}
     for row in rows[:3]:
