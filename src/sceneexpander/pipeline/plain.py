@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.store import read_json, read_typed, to_plain, write_json_atomic
+from sceneexpander.artifacts.store import read_json, read_typed, sha256_of_file, to_plain, write_json_atomic
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import EXIT_BAD_INPUT, UserError, entry_point, printable
@@ -45,7 +45,6 @@ _SCHEMA = "run/1"
 _IGNORED = ("__pycache__", ".venv")
 _IGNORED_ENDS = (".pyc", ".so", ".part", ".old")
 _ABSENT = "absent"
-_BLOCK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,12 +86,9 @@ class Hasher:
         found = self.known.get(str(path))
         if found is not None and tuple(found[:3]) == mark:
             return found[3]
-        digest = hashlib.sha256()
-        with path.open("rb") as file:
-            while block := file.read(_BLOCK_BYTES):
-                digest.update(block)
-        self.known[str(path)] = (*mark, digest.hexdigest())
-        return digest.hexdigest()
+        digest = sha256_of_file(path)
+        self.known[str(path)] = (*mark, digest)
+        return digest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
