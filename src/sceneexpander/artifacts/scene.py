@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.artifacts.store import (
@@ -59,7 +59,9 @@ class KnownCameras:
     metric: bool = False
     capture_from_world: Matrix4 | None = None
 
-    def similarity_from(self, world_from_cam: Float[Tensor, "view 4 4"]) -> Similarity | None:
+    def similarity_from(
+        self, world_from_cam: Float[Tensor, "view 4 4"], found: Bool[Tensor, "view"]
+    ) -> Similarity | None:
         """The map (double precision) from the frame of a reconstruction to the capture's own world.
 
         It is found from the cameras that both have, so it holds whatever the reconstruction did with frame and scale; exact where given
@@ -67,6 +69,7 @@ class KnownCameras:
 
         Args:
             world_from_cam: estimated poses of all views, the first ones those of this object.
+            found: which of them were; the others take no part.
 
         Returns:
             None if fewer than two views at different places have a known pose: then the capture's scale is not known.
@@ -74,7 +77,7 @@ class KnownCameras:
         given = self.world_from_cam
         if given is None or self.capture_from_world is None:
             return None
-        posed = torch.isfinite(given).all(-1).all(-1)
+        posed = torch.isfinite(given).all(-1).all(-1) & found[: len(given)].to(given.device)
         if int(posed.sum()) < 2:
             return None
         own = torch.tensor(self.capture_from_world, dtype=torch.float64)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.store import FACTS_NAME, ArtifactError
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
@@ -77,7 +78,7 @@ class Crop:
 
 
 def load_scene(folder: Path, number: int, method: str) -> ExportScene:
-    """Read a round's reconstruction by one method.
+    """Read a round's reconstruction by one method, in the world of the capture where that is known, else in the scene's own frame.
 
     Args:
         folder: what the pipeline made of one scene, ``outputs/<scene>``.
@@ -101,7 +102,8 @@ def load_scene(folder: Path, number: int, method: str) -> ExportScene:
     if lacking is not None:
         raise UserError(f"{method} {lacking.reason}", where=base, fix=f"there are {', '.join(made)}")
     reconstruction = Reconstruction.load(base / method / "reconstruction")
-    name, places, how = _pictures(folder, number)
+    captured = Scene.load(folder / "scene")
+    places, how = _pictures(captured, folder, number)
     missing = [view for view in reconstruction.view_ids if view not in places]
     if missing:
         raise ArtifactError(f"no picture of view {missing[0]}", where=folder, fix="rerun the pipeline")
@@ -113,7 +115,7 @@ def load_scene(folder: Path, number: int, method: str) -> ExportScene:
         if posed[index]
     )
     statement = Statement(
-        scene=name,
+        scene=captured.name,
         round=number,
         method=method,
         part="all",
@@ -122,17 +124,19 @@ def load_scene(folder: Path, number: int, method: str) -> ExportScene:
         generated_views=tuple(how[view] for view in reconstruction.view_ids if view in how),
         unposed_views=tuple(v for v, known in zip(reconstruction.view_ids, posed, strict=True) if not known),
     )
-    return ExportScene(reconstruction=reconstruction, views=views, images=images, statement=statement)
+    scene = ExportScene(reconstruction=reconstruction, views=views, images=images, statement=statement)
+    given = captured.known
+    if given is None:
+        return scene
+    capture_from_scene = given.similarity_from(reconstruction.world_from_cam, reconstruction.posed)
+    return scene if capture_from_scene is None else place_scene(scene, capture_from_scene, metric=given.metric)
 
 
 _Pictures = dict[str, tuple[ViewRecord, Path, Tensor]]
 
 
-def _pictures(folder: Path, number: int) -> tuple[str, _Pictures, dict[str, GeneratedView]]:
-    """(scene's name, record, folder and stored picture of every view, what is known about the generated ones)."""
-    from sceneexpander.artifacts.scene import Scene
-
-    scene = Scene.load(folder / "scene")
+def _pictures(scene: Scene, folder: Path, number: int) -> tuple[_Pictures, dict[str, GeneratedView]]:
+    """(record, folder and stored picture of every view, what is known about the generated ones)."""
     places = _places(scene.views, folder / "scene" / "views")
     how: dict[str, GeneratedView] = {}
     for earlier in range(1, number + 1):
@@ -148,7 +152,7 @@ def _pictures(folder: Path, number: int) -> tuple[str, _Pictures, dict[str, Gene
             sha256=record.sha256,
             provenance=inserted.provenance[inserted.chosen],
         )
-    return scene.name, places, how
+    return places, how
 
 
 def _places(views: ViewSet, folder: Path) -> _Pictures:

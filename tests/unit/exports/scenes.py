@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.scene import RoundSpec, Scene
+from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.geometry.camera import camera_vector_from_pose, unproject_to_world
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
@@ -88,12 +88,13 @@ def views(ids: tuple[str, ...], *, generated: bool) -> ViewSet:
     return ViewSet(records=records, images=fine[..., ::FINER, ::FINER], detail_images=fine, photos=photos)
 
 
-def save_finished(folder: Path) -> Path:
+def save_finished(folder: Path, known: KnownCameras | None = None) -> Path:
     """What the pipeline leaves of one round."""
     Scene(
         name="wall",
         views=views(VIEWS[:GENERATED], generated=False),
         rounds=(RoundSpec(prompt="a well"),),
+        known=known,
     ).save(folder / "scene")
     how = Provenance(
         backend="openai",

@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
+from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.source_type import read_source_type
 from sceneexpander.errors import UserError
 from sceneexpander.export import main
@@ -207,6 +208,22 @@ def test_one_similarity_moves_everything(scene: ExportScene) -> None:
         torch.testing.assert_close(after.world_from_cam, MOVED.poses(before.world_from_cam))
     back = place_scene(moved, MOVED.inverse())
     torch.testing.assert_close(back.reconstruction.gaussians.sh, scene.reconstruction.gaussians.sh, atol=1e-5, rtol=0)
+
+
+def test_a_scene_whose_capture_has_a_world_is_exported_in_it(scene: ExportScene, tmp_path: Path) -> None:
+    there = MOVED.poses(poses()[:GENERATED].double())
+    known = KnownCameras(
+        world_from_cam=(rigid_inverse(there[:1]) @ there).float(),
+        metric=True,
+        capture_from_world=tuple(tuple(row) for row in there[0].tolist()),  # type: ignore[arg-type]
+    )
+    found = load_scene(save_finished(tmp_path / "wall", known), 1, "sceneexpander")
+    assert found.statement.metric
+    for view, pose in zip(found.views, MOVED.poses(poses().double()), strict=True):
+        torch.testing.assert_close(view.world_from_cam, pose, atol=1e-4, rtol=0)
+    wanted = place_scene(scene, MOVED).reconstruction
+    torch.testing.assert_close(found.reconstruction.gaussians.means, wanted.gaussians.means, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.reconstruction.depth, wanted.depth, atol=1e-3, rtol=0)
 
 
 def test_parts_and_crops(scene: ExportScene) -> None:

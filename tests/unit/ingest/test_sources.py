@@ -199,7 +199,7 @@ def test_the_capture_world_is_found_again_after_any_similarity(tmp_path: Path) -
     assert known.world_from_cam is not None
     moved = known.world_from_cam.clone()
     moved[:, :3, 3] *= 0.37
-    found = known.similarity_from(moved)
+    found = known.similarity_from(moved, torch.ones(len(moved), dtype=torch.bool))
     assert found is not None
     assert found.scale == pytest.approx(1 / 0.37, rel=1e-4)
     np.testing.assert_allclose(found.poses(moved.double())[2].numpy(), pose(2), atol=1e-4)
