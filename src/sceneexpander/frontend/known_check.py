@@ -18,6 +18,7 @@ from sceneexpander.frontend.twoview import PairMatches, fundamental_from_poses, 
 
 _AGREE_PX = 3.0  # at 768 px, from the epipolar line
 _LEAST_MATCHES = 40  # of a view with all others, for a number that says something
+_LEAST_OF_PAIR = 20  # of a view with one other, for the same
 _NO_BASELINE = 1e-6  # of the largest distance between cameras: nothing to be seen of an epipolar line
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -71,7 +72,8 @@ def compare_with_matches(
     """Which of the given cameras fewer than `SfmConfig.min_agreeing` of a view's matches agree with.
 
     Intrinsics first: the share of verified matches that some motion explains at the given focal lengths. Then poses: the share that lies on
-    the epipolar lines of the given motion; the view that agrees least is taken out, and the rest is asked again. Poses without intrinsics
+    the epipolar lines of the given motion, with all other views and with the one that agrees most; the view that agrees least is taken
+    out, and the rest is asked again. Poses without intrinsics
     draw no epipolar line and are believed.
 
     Args:
@@ -98,10 +100,13 @@ def compare_with_matches(
     first_share = near[posed][:, posed].sum() / max(1, total[posed][:, posed].sum())
     while posed.sum() >= 2:
         agreeing, asked = (table[:, posed].sum(1) for table in (near, total))
-        shares = np.where(posed & (asked >= _LEAST_MATCHES), agreeing / np.maximum(1, asked), 1.0)
-        worst = int(shares.argmin())
-        if shares[worst] >= config.min_agreeing:
+        shares = agreeing / np.maximum(1, asked)
+        # Matches of views that hardly overlap are often of things that only look alike, but no wrong pose agrees with a neighbour.
+        by_pair = np.where(total >= _LEAST_OF_PAIR, near / np.maximum(1, total), 0.0)[:, posed].max(1)
+        doubted = posed & (asked >= _LEAST_MATCHES) & (np.maximum(shares, by_pair) < config.min_agreeing)
+        if not doubted.any():
             break
+        worst = int(np.where(doubted, shares, 1.0).argmin())
         posed[worst] = False
         notes.append(
             f"{setup.names[worst]}: its given pose contradicts the pictures: {shares[worst]:.0%} of {int(asked[worst])} matches agree"
