@@ -224,8 +224,9 @@ def test_two_tabs_and_a_double_click(tab: Page, crowd: dict[str, Person], built:
     assert person.post("answer", {"screen": name, "ranks": other}).status_code == 200
     tab.value("$('next').click(); $('next').click()")
     tab.wait(f"state.done.includes('{name}') && !busy")
+    tab.wait("$('notice').textContent.includes('The first answer counts')")
+    second = place(tab, person)  # the next screen is open, and has asked the server so
     assert "The first answer counts" in tab.value("$('notice').textContent")
-    second = place(tab, person)
     assert second != name
     tab.value("$('next').click(); $('next').click(); send(); send()")
     tab.wait(f"state.done.includes('{second}') && !busy")

@@ -17,6 +17,7 @@ function keep(value) { try { localStorage.setItem(KEPT, JSON.stringify(value)); 
 function kept() { try { return JSON.parse(localStorage.getItem(KEPT)); } catch { return null; } }
 function forget() { try { localStorage.removeItem(KEPT); } catch { /* as above */ } }
 
+const LOST = "No connection to the study. Your places are kept on this device; trying again …";
 function notice(text) { $("notice").textContent = text; $("notice").hidden = !text; }
 
 function pause(seconds) {
@@ -42,9 +43,12 @@ async function ask(path, body) {
       const reply = await fetch(path, options);
       const content = await reply.json();
       clearTimeout(timer);
-      if (reply.status < 500) { notice(""); return { status: reply.status, content }; }
+      if (reply.status < 500) {
+        if ($("notice").textContent === LOST) notice(""); // what else is said there is about something else
+        return { status: reply.status, content };
+      }
     } catch { /* no connection, or cut in the middle */ }
-    notice("No connection to the study. Your places are kept on this device; trying again …");
+    notice(LOST);
     await pause(wait);
   }
 }
@@ -189,6 +193,7 @@ async function send() {
   if ($("missing").textContent) return;
   busy = true;
   $("next").disabled = true;
+  notice("");
   keep({ screen: screen.name, places, watched, sending: true });
   const ranks = Object.fromEntries(screen.videos.map((name, index) => [name, places[index]]));
   try {
@@ -202,7 +207,7 @@ async function send() {
         continue;
       }
       forget();
-      if (reply.status === 200) follow(reply.content);
+      if (reply.status === 200) { notice(""); follow(reply.content); }
       else { await refresh(); notice("This screen had been answered before, perhaps in another tab. The first answer counts."); }
       return;
     }
@@ -220,6 +225,7 @@ async function refresh() {
 
 $("begin").onclick = async () => {
   if (!$("agree").checked) { notice("Please tick the box first, or close the page."); $("agree").focus(); return; }
+  notice("");
   const reply = await ask("api/consent", {});
   if (reply.status === 200) follow(reply.content); else refresh();
 };
