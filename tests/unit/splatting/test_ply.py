@@ -270,3 +270,16 @@ def test_a_count_that_no_file_holds_is_one_line(tmp_path: Path, encoding: str, e
 def test_a_name_that_is_no_file_is_one_line(tmp_path: Path, name: str) -> None:
     with pytest.raises(UserError):
         read_ply(tmp_path / name)
+
+
+@pytest.mark.parametrize(("comments", "readable"), [(60_000, True), (70_000, False)])
+def test_a_header_may_be_long_but_not_without_end(tmp_path: Path, comments: int, readable: bool) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(random_gaussians(3), path)
+    raw = path.read_bytes()
+    path.write_bytes(raw.replace(b"\nelement", b"\ncomment " + b"x" * comments + b"\nelement", 1))
+    if readable:
+        assert len(read_ply(path)) == 3
+    else:
+        with pytest.raises(UserError, match="end_header"):
+            read_ply(path)

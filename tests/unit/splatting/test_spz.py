@@ -221,3 +221,12 @@ def test_few_bytes_that_stand_for_very_many_gaussians_are_refused_before_they_ar
 def test_a_name_that_is_no_file_is_one_line(tmp_path: Path, name: str) -> None:
     with pytest.raises(UserError):
         read_spz(tmp_path / name)
+
+
+def test_large_files_of_ordinary_content_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit on what a file may unpack to is about its own length."""
+    from sceneexpander.splatting import spz
+
+    monkeypatch.setattr(spz, "SMALL_BYTES", 1000)
+    write_spz(random_gaussians(2000), tmp_path / "a.spz")
+    assert len(read_spz(tmp_path / "a.spz")) == 2000
