@@ -102,6 +102,34 @@ def test_the_unit_of_the_truth_does_not_count(unit: float) -> None:
     assert found.new_region_abs_rel == pytest.approx(expected.new_region_abs_rel, abs=1e-5)
 
 
+@pytest.mark.parametrize("border", [(slice(None), 0), (slice(None), -1), (0, slice(None)), (-1, slice(None))])
+def test_every_border_pixel_is_compared_with_its_own_truth(border: tuple[Any, Any]) -> None:
+    scene = made()
+    depth = scene.depth.clone()
+    depth[:, *border] *= 1.5
+    other = dataclasses.replace(scene, depth=depth)
+    assert errors(other, own_pictures(other), truth_of(other)).depth_abs_rel == pytest.approx(0, abs=1e-6)
+    assert errors(scene, own_pictures(scene), truth_of(other)).depth_abs_rel != pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("shift", [(-3.0, 0.0), (3.0, 0.0), (0.0, -3.0), (0.0, 3.0)])
+def test_stored_pixels_beyond_the_original_have_no_truth(shift: tuple[float, float]) -> None:
+    """A letterboxed view: its bars are left out on whichever side they are, and the rest is where it was."""
+    scene = made()
+    pictures = own_pictures(scene)
+    affine = ((1.0, 0.0, shift[0]), (0.0, 1.0, shift[1]))
+    records = tuple(dataclasses.replace(record, stored_from_original=affine) for record in pictures.records)
+    truth = truth_of(scene)
+    ramp = DEPTH * (1 + torch.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) / (HEIGHT * WIDTH))
+    views = {key: dataclasses.replace(own, depth=ramp) for key, own in truth.views.items()}
+    x, y = int(shift[0]), int(shift[1])
+    seen = torch.roll(ramp, (y, x), (0, 1)).expand_as(scene.depth)
+    found = errors(
+        dataclasses.replace(scene, depth=seen), dataclasses.replace(pictures, records=records), SceneTruth(views=views)
+    )
+    assert found.depth_abs_rel == pytest.approx(0, abs=1e-6)
+
+
 def test_a_turned_inserted_camera() -> None:
     scene = made()
     angle = math.radians(5)

@@ -199,3 +199,24 @@ def test_non_finite_numbers_are_refused() -> None:
 def test_config_range() -> None:
     with pytest.raises(UserError, match="coverage_alpha"):
         EvaluateConfig(coverage_alpha=1.0)
+
+
+def test_what_others_show_thinly_is_compared_by_its_colour() -> None:
+    """Half transparent is not darker: black behind the scene belongs to nobody."""
+    scene = made_reconstruction()
+    thin = dataclasses.replace(
+        scene, gaussians=dataclasses.replace(scene.gaussians, opacities=scene.gaussians.opacities * 0.5)
+    )
+    config = EvaluateConfig(st_lpips=False, coverage_alpha=0.2)
+    pictures = own_pictures(scene)
+    solid, seen = (preservation(one, pictures, config)[0].others_psnr_db for one in (scene, thin))
+    assert solid is not None
+    assert seen is not None
+    assert solid > 30
+    assert seen > 30
+
+
+def test_the_perceptual_distance_can_be_left_out() -> None:
+    scene = made_reconstruction()
+    rows = preservation(scene, own_pictures(scene), EvaluateConfig(st_lpips=False))
+    assert [row.st_lpips for row in rows] == [None] * len(rows)
