@@ -1,4 +1,4 @@
-"""Many configurations at once: ``sceneexpander sweep --multirun ablation=baseline,anchor,full``.
+"""Many configurations at once: ``sceneexpander sweep --multirun ablation=baseline,anchor,paper``.
 
 Each combination runs as its own workspace; what they have in common runs once. ``scene=a,b`` or ``scene=glob(*)`` makes jobs over
 folders of ``scenes/``; without it the scenes are those of params.yaml, and so are rounds and methods in any case.
@@ -118,7 +118,7 @@ def check_axes(arguments: Sequence[str], project: Path) -> Axes:
     given = [item for item in arguments if not item.startswith("-")]
     for item in given:
         if "=" not in item and not item.startswith("~"):
-            raise UserError("is not a setting", where=item, fix="write key=value, e.g. ablation=baseline,full")
+            raise UserError("is not a setting", where=item, fix="write key=value, e.g. ablation=baseline,paper")
     scenes = [item for item in given if key_of(item) == SCENE_KEY and "=" in item]
     if len(scenes) > 1:
         raise UserError("is given twice", where=SCENE_KEY, fix="write scene=a,b")
@@ -332,7 +332,7 @@ def make_parser() -> CommandParser:
         "sweep",
         "Run the pipeline for every combination of settings. Each is a workspace of its own; what they have in common runs once.",
         examples=[
-            "--multirun ablation=baseline,full seed=0,1,2",
+            "--multirun ablation=baseline,paper seed=0,1,2",
             "--multirun 'scene=glob(*)' profile=smoke",
             "--multirun hydra/launcher=slurm 'ablation=glob(*)'",
         ],
@@ -361,7 +361,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if not given:
         raise UserError(
-            "nothing to sweep over", where="sceneexpander sweep", fix="add --multirun ablation=baseline,full"
+            "nothing to sweep over", where="sceneexpander sweep", fix="add --multirun ablation=baseline,paper"
         )
     axes = check_axes(given, project)
     check_inputs(axes.jobs, project)

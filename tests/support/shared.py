@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+ABSENT = "recorded fixtures are absent"  # what the summary of the tests counts
+
 
 def shared_folder(name: str) -> Path:
     """A folder of recorded fixtures or specifications; skips the test where it is absent.
@@ -16,5 +18,5 @@ def shared_folder(name: str) -> Path:
     root = Path(os.environ.get("SCENEEXPANDER_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
     folder = root / name
     if not folder.exists():
-        pytest.skip(f"recorded fixtures are absent: {name} (set SCENEEXPANDER_SHARED)")
+        pytest.skip(f"{ABSENT}: {name} (set SCENEEXPANDER_SHARED)")
     return folder

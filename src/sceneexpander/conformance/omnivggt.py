@@ -69,12 +69,18 @@ def config_from_case(case: dict[str, Any]) -> OmniVGGTConfig:
 
 def run_model_case(path: Path) -> list[OutputCheck]:
     """Load the recorded weights strictly, do every run, compare every recorded tensor."""
+    outputs, expected = model_outputs(path), read_tensors(path / "outputs.safetensors")
+    return [_compare(name, outputs, expected[name]) for name in sorted(expected)]
+
+
+def model_outputs(path: Path) -> dict[str, Tensor]:
+    """Everything that a case can record, of this implementation."""
     case = read_config(path / "config.json")
     try:
         config, runs = config_from_case(case), case["runs"]
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"is not a complete configuration ({error})", where=path / "config.json") from None
-    inputs, expected = read_tensors(path / "inputs.safetensors"), read_tensors(path / "outputs.safetensors")
+    inputs = read_tensors(path / "inputs.safetensors")
     with torch.device("meta"):
         model = OmniVGGT(config)
     load_weights(model, path / "weights.safetensors")
@@ -82,7 +88,7 @@ def run_model_case(path: Path) -> list[OutputCheck]:
     for run in runs:
         group = {name: inputs[f"{run['inputs']}.{name}"] for name in ("images", *PRIOR_TENSORS)}
         outputs |= {f"{run['name']}.{name}": value for name, value in _run(model, group, run).items()}
-    return [_compare(name, outputs, expected[name]) for name in sorted(expected)]
+    return outputs
 
 
 PRIOR_TENSORS = ("extrinsics", "intrinsics", "depth", "mask")

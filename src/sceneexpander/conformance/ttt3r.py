@@ -54,8 +54,19 @@ def config_from_case(sizes: dict[str, Any], run: dict[str, Any]) -> TTT3RConfig:
 
 def run_stream_case(path: Path) -> list[OutputCheck]:
     """Load the recorded weights strictly, run every recorded stream, compare every recorded tensor."""
+    outputs, tolerances = stream_outputs(path)
+    expected = read_tensors(path / "outputs.safetensors")
+    checks = [_compare(name, outputs, expected[name], tolerances.get(name, SINGLE)) for name in sorted(expected)]
+    for name, value in outputs.items():
+        if name.endswith("inter.enc_tokens") and name in expected and tolerances[name] == HALF_ROPE:
+            checks.append(_mean_check(name, value, expected[name]))
+    return checks + _ray_checks(read_tensors(path / "inputs.safetensors"))
+
+
+def stream_outputs(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
+    """Everything that a case can record, of this implementation, and the tolerance of each."""
     case = read_config(path / "config.json")
-    inputs, expected = read_tensors(path / "inputs.safetensors"), read_tensors(path / "outputs.safetensors")
+    inputs = read_tensors(path / "inputs.safetensors")
     outputs: dict[str, Tensor] = {}
     tolerances: dict[str, float] = {}
     try:
@@ -69,11 +80,7 @@ def run_stream_case(path: Path) -> list[OutputCheck]:
     rows, columns = config.state_grid
     positions = grid_positions(rows, columns, specials=0, origin=POSE_POSITION)[: config.state_tokens]
     outputs["state_pos"], tolerances["state_pos"] = torch.from_numpy(positions), 0.0
-    checks = [_compare(name, outputs, expected[name], tolerances.get(name, SINGLE)) for name in sorted(expected)]
-    for name, value in outputs.items():
-        if name.endswith("inter.enc_tokens") and name in expected and tolerances[name] == HALF_ROPE:
-            checks.append(_mean_check(name, value, expected[name]))
-    return checks + _ray_checks(inputs)
+    return outputs, tolerances
 
 
 def _run_stream(path: Path, config: TTT3RConfig, run: dict[str, Any], inputs: dict[str, Tensor]) -> dict[str, Tensor]:

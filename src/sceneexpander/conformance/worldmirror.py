@@ -78,13 +78,21 @@ def priors_from_case(inputs: dict[str, Tensor], flags: list[int]) -> BatchPriors
 
 def run_model_case(path: Path) -> list[OutputCheck]:
     """Load the recorded weights strictly, run on the recorded inputs, compare every recorded tensor."""
+    config, outputs = model_outputs(path)
+    expected = read_tensors(path / "outputs.safetensors")
+    checks = [_compare(name, outputs, expected[name]) for name in sorted(expected)]
+    return checks + _merge_alone(config, expected)
+
+
+def model_outputs(path: Path) -> tuple[WorldMirrorConfig, dict[str, Tensor]]:
+    """Everything that a case can record, of this implementation."""
     case = read_config(path / "config.json")
     try:
         config = config_from_case(case)
         flags, is_inference = case["inputs"]["cond_flags"], case["is_inference"]
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"is not a complete configuration ({error})", where=path / "config.json") from None
-    inputs, expected = read_tensors(path / "inputs.safetensors"), read_tensors(path / "outputs.safetensors")
+    inputs = read_tensors(path / "inputs.safetensors")
     with torch.device("meta"):
         model = WorldMirror(config)
     load_weights(model, path / "weights.safetensors")
@@ -95,9 +103,7 @@ def run_model_case(path: Path) -> list[OutputCheck]:
             outputs = _outputs(model(inputs["img"], priors))
         else:
             outputs = _novel_view_outputs(model, inputs, priors)
-    outputs |= trace.tensors(inputs)
-    checks = [_compare(name, outputs, expected[name]) for name in sorted(expected)]
-    return checks + _merge_alone(config, expected)
+    return config, outputs | trace.tensors(inputs)
 
 
 def _compare(name: str, outputs: dict[str, Tensor], expected: Tensor) -> OutputCheck:

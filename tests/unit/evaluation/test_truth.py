@@ -79,6 +79,56 @@ def test_frame_and_scale_do_not_count() -> None:
     assert found.new_region_abs_rel == pytest.approx(0, abs=1e-5)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_the_unit_of_the_truth_does_not_count(unit: float) -> None:
+    """Kilometres or millimetres: the share of an error is the same."""
+    scene = made()
+    truth = truth_of(scene)
+    wrong = scene.depth.clone()
+    wrong[0, :, : WIDTH // 4] *= 1.1
+    estimated = dataclasses.replace(scene, depth=wrong)
+    views = {}
+    for key, own in truth.views.items():
+        pose = own.world_from_cam.clone()
+        pose[:3, 3] *= unit
+        depth = None if own.depth is None else own.depth * unit
+        views[key] = dataclasses.replace(own, world_from_cam=pose, depth=depth)
+    found = errors(estimated, own_pictures(scene), SceneTruth(views=views))
+    expected = errors(estimated, own_pictures(scene), truth)
+    assert expected.depth_abs_rel is not None
+    assert expected.depth_abs_rel > 0.001
+    assert found.depth_abs_rel == pytest.approx(expected.depth_abs_rel, rel=1e-4)
+    assert found.new_region_abs_rel == pytest.approx(expected.new_region_abs_rel, abs=1e-5)
+
+
+@pytest.mark.parametrize("border", [(slice(None), 0), (slice(None), -1), (0, slice(None)), (-1, slice(None))])
+def test_every_border_pixel_is_compared_with_its_own_truth(border: tuple[Any, Any]) -> None:
+    scene = made()
+    depth = scene.depth.clone()
+    depth[:, *border] *= 1.5
+    other = dataclasses.replace(scene, depth=depth)
+    assert errors(other, own_pictures(other), truth_of(other)).depth_abs_rel == pytest.approx(0, abs=1e-6)
+    assert errors(scene, own_pictures(scene), truth_of(other)).depth_abs_rel != pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("shift", [(-3.0, 0.0), (3.0, 0.0), (0.0, -3.0), (0.0, 3.0)])
+def test_stored_pixels_beyond_the_original_have_no_truth(shift: tuple[float, float]) -> None:
+    """A letterboxed view: its bars are left out on whichever side they are, and the rest is where it was."""
+    scene = made()
+    pictures = own_pictures(scene)
+    affine = ((1.0, 0.0, shift[0]), (0.0, 1.0, shift[1]))
+    records = tuple(dataclasses.replace(record, stored_from_original=affine) for record in pictures.records)
+    truth = truth_of(scene)
+    ramp = DEPTH * (1 + torch.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) / (HEIGHT * WIDTH))
+    views = {key: dataclasses.replace(own, depth=ramp) for key, own in truth.views.items()}
+    x, y = int(shift[0]), int(shift[1])
+    seen = torch.roll(ramp, (y, x), (0, 1)).expand_as(scene.depth)
+    found = errors(
+        dataclasses.replace(scene, depth=seen), dataclasses.replace(pictures, records=records), SceneTruth(views=views)
+    )
+    assert found.depth_abs_rel == pytest.approx(0, abs=1e-6)
+
+
 def test_a_turned_inserted_camera() -> None:
     scene = made()
     angle = math.radians(5)
@@ -282,6 +332,20 @@ def test_cameras_that_are_none_are_named(tmp_path: Path, key: str, value: object
     with pytest.raises(ArtifactError, match=r"cameras\.json: ") as caught:
         load_truth(scene)
     assert len(caught.value.line()) < 500 + len(str(path))
+
+
+@pytest.mark.parametrize(("shear", "fine"), [(0.004, True), (0.03, False)])
+def test_a_rotation_may_be_rounded_but_not_sheared(tmp_path: Path, shear: float, fine: bool) -> None:
+    scene = tmp_path / "scene"
+    path, content = truth_folder(scene)
+    pose = np.eye(4)
+    pose[0, 1] = shear
+    path.write_text(json.dumps({**content, "captured": [{**content["captured"][0], "world_from_cam": pose.tolist()}]}))
+    if fine:
+        load_truth(scene)
+    else:
+        with pytest.raises(ArtifactError, match=r"cameras\.json: "):
+            load_truth(scene)
 
 
 @pytest.mark.parametrize(

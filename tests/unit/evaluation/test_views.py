@@ -241,3 +241,26 @@ def test_same_place_without_any_camera_on_both_sides_takes_all() -> None:
     scene = made_reconstruction()
     lost = dataclasses.replace(scene, posed=torch.zeros(3, dtype=torch.bool))
     torch.testing.assert_close(same_place(scene.world_from_cam, scene, lost), scene.world_from_cam, atol=1e-5, rtol=0)
+
+
+def test_what_others_show_thinly_is_compared_by_its_colour() -> None:
+    """Half transparent is not darker: black behind the scene belongs to nobody."""
+    scene = made_reconstruction()
+    thin = dataclasses.replace(
+        scene, gaussians=dataclasses.replace(scene.gaussians, opacities=scene.gaussians.opacities * 0.5)
+    )
+    config = EvaluateConfig(st_lpips=False, coverage_alpha=0.2)
+    pictures = own_pictures(scene)
+    solid, seen = (
+        measure_views(one, pictures, config, MEASURES, generated=False)[0].values["psnr_from_others_db"]
+        for one in (scene, thin)
+    )
+    assert solid > 30
+    assert seen > 30
+
+
+def test_the_perceptual_distance_can_be_left_out() -> None:
+    scene = made_reconstruction()
+    rows = measure_views(scene, own_pictures(scene), EvaluateConfig(st_lpips=False), MEASURES, generated=False)
+    assert rows
+    assert not any("st_lpips_captured" in row.values for row in rows)

@@ -295,3 +295,16 @@ def test_other_programs_say_it_in_their_own_words(tmp_path: Path, comment: str, 
     raw = (tmp_path / "a.ply").read_bytes().replace(b"comment made elsewhere", f"comment {comment}".encode())
     (tmp_path / "a.ply").write_bytes(raw)
     assert read_ply(tmp_path / "a.ply").antialiased is antialiased
+
+
+@pytest.mark.parametrize(("comments", "readable"), [(60_000, True), (70_000, False)])
+def test_a_header_may_be_long_but_not_without_end(tmp_path: Path, comments: int, readable: bool) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(random_gaussians(3), path)
+    raw = path.read_bytes()
+    path.write_bytes(raw.replace(b"\nelement", b"\ncomment " + b"x" * comments + b"\nelement", 1))
+    if readable:
+        assert len(read_ply(path)) == 3
+    else:
+        with pytest.raises(UserError, match="end_header"):
+            read_ply(path)

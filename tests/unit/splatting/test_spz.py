@@ -292,3 +292,12 @@ def test_how_opacities_are_meant_is_the_first_flag(tmp_path: Path, antialiased: 
     write_spz(replace(bounded(5), antialiased=antialiased), tmp_path / "a.spz")
     assert gzip.decompress((tmp_path / "a.spz").read_bytes())[14] == int(antialiased)
     assert read_spz(tmp_path / "a.spz").antialiased is antialiased
+
+
+def test_large_files_of_ordinary_content_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit on what a file may unpack to is about its own length."""
+    from sceneexpander.splatting import spz
+
+    monkeypatch.setattr(spz, "SMALL_BYTES", 1000)
+    write_spz(random_gaussians(2000), tmp_path / "a.spz")
+    assert len(read_spz(tmp_path / "a.spz")) == 2000
