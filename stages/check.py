@@ -26,6 +26,7 @@ def main() -> None:
             conf=CONF,
             overrides=written_out(selection.overrides),
             rounds=selection.rounds,
+            round_overrides=[written_out(more) for more in selection.round_overrides],
             methods=selection.methods,
             checked=checked,
         )

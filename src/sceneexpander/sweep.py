@@ -86,6 +86,7 @@ def _check(selection: Selection, project: Path, *, device: bool = True) -> None:
             conf=project / "conf",
             overrides=selection.overrides,
             rounds=selection.rounds,
+            round_overrides=selection.round_overrides,
             methods=selection.methods,
             device=device,
             checked=_CHECKED,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from jaxtyping import Float
@@ -18,7 +18,8 @@ from sceneexpander.artifacts.store import (
 )
 from sceneexpander.artifacts.views import ViewSet
 
-SCHEMA = "scene/1"
+SCHEMA = "scene/2"
+ROUND_SCHEMA = "asked-round/1"
 KNOWN_SCHEMA = "known-cameras/1"
 
 
@@ -34,6 +35,16 @@ class RoundSpec:
     new_object: str = ""
     inserted: str | None = None
     inserted_sha256: str | None = None
+
+    def save(self, folder: Path) -> None:
+        """Write into a (scratch) folder."""
+        save_artifact(folder, ROUND_SCHEMA, {f.name: getattr(self, f.name) for f in fields(self)}, {})
+
+    @classmethod
+    def load(cls, folder: Path) -> RoundSpec:
+        """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
+        facts, _ = load_artifact(folder, ROUND_SCHEMA)
+        return read_typed(cls, facts, folder / FACTS_NAME)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,11 +76,14 @@ class _KnownFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Made by ``prepare``; read by every later stage. ``notes`` say what was noticed about the user's files."""
+    """Made by ``prepare``; read by every later stage. ``notes`` say what was noticed about the user's files.
+
+    Saved without its ``rounds``: each of them is an artefact of its own, so that one more leaves everything else as it is.
+    """
 
     name: str
     views: ViewSet
-    rounds: tuple[RoundSpec, ...]
+    rounds: tuple[RoundSpec, ...] = ()
     known: KnownCameras | None = None
     notes: tuple[str, ...] = ()
 
@@ -84,7 +98,7 @@ class Scene:
         return self.rounds[number - 1]
 
     def save(self, folder: Path) -> None:
-        """Write into a (scratch) folder."""
+        """Write all but the rounds into a (scratch) folder."""
         self.views.save(folder / "views")
         tensors: dict[str, Tensor] = {}
         if self.known is not None:
@@ -93,20 +107,18 @@ class Scene:
                 if value is not None:
                     tensors[f"known.{key}"] = value
         metric = self.known is not None and self.known.metric
-        facts = {"name": self.name, "rounds": self.rounds, "metric": metric, "notes": self.notes}
+        facts = {"name": self.name, "metric": metric, "notes": self.notes}
         save_artifact(folder, SCHEMA, facts, tensors)
 
     @classmethod
     def load(cls, folder: Path) -> Scene:
-        """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
+        """Read what `save` wrote: a scene without rounds. Raises `ArtifactError` if it is missing or damaged."""
         facts, tensors = load_artifact(folder, SCHEMA)
         read = read_typed(_Facts, facts, folder / FACTS_NAME)
         known = None
         if tensors:
             known = KnownCameras(**load_fields(KnownCameras, {"metric": read.metric}, tensors, folder, prefix="known."))
-        return cls(
-            name=read.name, views=ViewSet.load(folder / "views"), rounds=read.rounds, known=known, notes=read.notes
-        )
+        return cls(name=read.name, views=ViewSet.load(folder / "views"), known=known, notes=read.notes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,6 +126,5 @@ class _Facts:
     """What is not a tensor or an artefact of its own."""
 
     name: str
-    rounds: tuple[RoundSpec, ...]
     metric: bool
     notes: tuple[str, ...]
