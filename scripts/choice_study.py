@@ -25,11 +25,12 @@ from sceneexpander.errors import entry_point
 from sceneexpander.expandbench import build_scene, measure, prepare_case
 from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.prepared import prepare_scene
-from sceneexpander.expansion import correct_round, load_model, refined, refined_round
+from sceneexpander.expansion import MethodConfig, compose_procedure, load_model
 from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.rank import rank_candidates
 from sceneexpander.ingest.fit import fit_picture
+from sceneexpander.photometric.fitting import fit_to_views
 from sceneexpander.project import find_project
 
 GRADES = "mixed_1,mixed_2,mixed_4,stretch_8,zoom_10,hallucinate"
@@ -64,16 +65,17 @@ def measure_scene(name: str, grades: Sequence[str], config: ProjectConfig, cache
     """Rank and expand all candidates of a scene."""
     scene, loaded = build_scene(name), load_model(config.model)
     before = prepare_scene(scene, loaded, config.frontend, config.warmup, cache)
-    fitted, _ = refined(before.captured, before.state.views, config.refine, doubt_generated=False, seed=config.seed)
+    fitted, _ = fit_to_views(before.captured, before.state.views, config.refine, seed=config.seed)
     so_far = SceneSoFar(views=before.state.views, reconstruction=fitted)
     cases = [prepare_case(scene, before, grade_named(grade), loaded, config.frontend, cache) for grade in grades]
     frame = frame_of(before.state.views)
     pictures = [fit_picture(to_uint8(case.inputs.inserted.view.detail_images[0]), frame, "crop") for case in cases]
     scores = {score.candidate: score for score in rank_candidates(pictures, so_far, seed=config.seed)}
+    method = MethodConfig(adapt=config.adapt, corrections=config.corrections)
+    procedure = compose_procedure(method, config.refine).without_steps()
     measured = []
     for index, (grade, case) in enumerate(zip(grades, cases, strict=True)):
-        state, made, _ = correct_round(case.inputs, loaded, config.adapt, seed=config.seed)
-        made, _ = refined_round(made, state, config.adapt, config.refine, seed=config.seed)
+        made = procedure.run(case.inputs, loaded, seed=config.seed).scene
         numbers = measure(made, case.inputs.state.views.append(case.inputs.inserted.view), case.truth, scene).values
         outcomes = {outcome: numbers.get(outcome) for outcome in OUTCOMES}
         measured.append(Candidate(scene=name, grade=grade, score=scores[index], outcomes=outcomes))

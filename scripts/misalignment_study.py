@@ -1,14 +1,11 @@
 """What the misalignment report says of pictures whose errors are known: python scripts/misalignment_study.py --scenes room_2 --cache FOLDER
 
-Per scene of the benchmark and grade one line: stretch and zoom as found, shares, and how the marks compare with the truth. With --fade
-also whether the expansion gains if Gaussians of contradicted pixels are made transparent before it is measured.
+Per scene of the benchmark and grade one line: stretch and zoom as found, shares, and how the marks compare with the truth.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,21 +16,17 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import entry_point
-from sceneexpander.expandbench import BenchScene, build_scene, measure, prepare_case
+from sceneexpander.expandbench import BenchScene, build_scene
 from sceneexpander.expandbench.grades import Grade, grade_named
 from sceneexpander.expandbench.prepared import PreparedScene, prepare_scene
-from sceneexpander.expansion import correct_round, load_model, refined_round
-from sceneexpander.expansion.rounds import RoundInputs
+from sceneexpander.expansion import load_model
 from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.misalignment import Misaligned, report_misalignment
-from sceneexpander.geometry.lookup import seen_at
 from sceneexpander.ingest.fit import fit_picture
 from sceneexpander.project import find_project
-from sceneexpander.reconstruction.loaded import LoadedModel
 
 GRADES = "clean,stretch_4,stretch_8,zoom_10,zoom_20,shift_5,mixed_2,hallucinate"
-OUTCOMES = ("psnr_new_region_db", "psnr_half_way_db", "psnr_captured_db")
 
 
 def hallucinated(scene: BenchScene, grade: Grade) -> np.ndarray:
@@ -63,28 +56,6 @@ def line(scene: BenchScene, grade: Grade, found: Misaligned) -> str:
     return text
 
 
-def outcomes(
-    scene: BenchScene,
-    inputs: RoundInputs,
-    truth: object,
-    loaded: LoadedModel,
-    config: ProjectConfig,
-    support: torch.Tensor | None,
-) -> Mapping[str, float | None]:
-    """What the corrected expansion got right; with ``support``, Gaussians of contradicted pixels take no part."""
-    state, made, _ = correct_round(inputs, loaded, config.adapt, seed=config.seed)
-    if support is not None:
-        own = made.gaussians.source_view == len(made.view_ids) - 1
-        camera = made.world_from_cam[-1:], made.intrinsics_px[-1:]
-        there, _, inside = seen_at(made.gaussians.means[own], support[None, None], *camera, "nearest")
-        opacities = made.gaussians.opacities.clone()
-        opacities[own] *= torch.where(inside[0], there[0, 0], 1.0)
-        made = replace(made, gaussians=replace(made.gaussians, opacities=opacities))
-    made, _ = refined_round(made, state, config.adapt, config.refine, seed=config.seed)
-    numbers = measure(made, inputs.state.views.append(inputs.inserted.view), truth, scene).values  # type: ignore[arg-type]
-    return {name: numbers.get(name) for name in OUTCOMES}
-
-
 def study_scene(name: str, options: argparse.Namespace, config: ProjectConfig) -> None:
     """Print the lines of a scene."""
     scene, loaded = build_scene(name), load_model(config.model)
@@ -97,10 +68,6 @@ def study_scene(name: str, options: argparse.Namespace, config: ProjectConfig) -
         picture = fit_picture(to_uint8(view.detail_images[0]), frame_of(before.state.views), "crop")
         found = report_misalignment(picture, so_far, seed=config.seed)
         print(line(scene, grade, found), flush=True)
-        if options.fade and found.support is not None:
-            case = prepare_case(scene, before, grade, loaded, config.frontend, cache)
-            for label, support in (("as given", None), ("faded", found.support)):
-                print("   ", label, outcomes(scene, case.inputs, case.truth, loaded, config, support), flush=True)
 
 
 @entry_point
@@ -110,7 +77,6 @@ def main() -> None:
     parser.add_argument("--scenes", required=True)
     parser.add_argument("--grades", default=GRADES)
     parser.add_argument("--cache", type=Path, required=True, help="prepared scenes, reused")
-    parser.add_argument("--fade", action="store_true")
     parser.add_argument("overrides", nargs="*", metavar="key=value")
     options = parser.parse_args()
     config = parse_dataclass(

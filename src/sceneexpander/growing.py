@@ -43,10 +43,10 @@ from sceneexpander.generation import backend_of
 from sceneexpander.ingest import make_round, read_picture
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.locks import RunLock, run_lock
+from sceneexpander.pipeline.preflight import check_scene
+from sceneexpander.pipeline.workspace import make_workspace, reproduce
 from sceneexpander.plainfiles import require_plain_file
-from sceneexpander.preflight import check_scene
 from sceneexpander.selection import MOST_ROUNDS, PARAMS, Selection, check_name, read_selection
-from sceneexpander.workspace import make_workspace, reproduce
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

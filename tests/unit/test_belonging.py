@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from sceneexpander import packages
 from sceneexpander.catalogue import METHODS, Kind
 from sceneexpander.catalogue.methods import methods_of
 from sceneexpander.environment import Environment
 from sceneexpander.errors import UserError
-from sceneexpander.fingerprint import SourceTree
-from sceneexpander.packages import LOCKS, installed_packages
+from sceneexpander.pipeline import packages
+from sceneexpander.pipeline.fingerprint import SourceTree
+from sceneexpander.pipeline.packages import LOCKS, installed_packages
 from sceneexpander.selection import ROUND_SECTIONS, Selection
 from stages import layout, runner
 from stages.fingerprint import stage_names

@@ -7,8 +7,8 @@ import yaml
 
 from sceneexpander.errors import UserError
 from sceneexpander.expand import parse_arguments, stage_scene
+from sceneexpander.pipeline.workspace import make_workspace, merged_overrides
 from sceneexpander.selection import Selection, read_selection
-from sceneexpander.workspace import make_workspace, merged_overrides
 
 ROOT = Path(__file__).parents[2]
 
@@ -52,7 +52,7 @@ def test_later_overrides_stand_and_files_become_absolute(tmp_path: Path, monkeyp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "w.safetensors").write_text("x")
     merged = merged_overrides(
-        ("seed=0", "ablation=full"), ("ablation=anchor", "model.weights=w.safetensors"), project=tmp_path
+        ("seed=0", "ablation=paper"), ("ablation=anchor", "model.weights=w.safetensors"), project=tmp_path
     )
     assert merged == ("seed=0", "ablation=anchor", f"model.weights={tmp_path / 'w.safetensors'}")
     assert merged_overrides((), ("model.weights=org/name@main",), project=tmp_path) == ("model.weights=org/name@main",)

@@ -56,10 +56,10 @@ def choose_view(
     assessed = [assess(item, so_far.views, choice.fit) for item in _with_own(context, candidates, choice)]
     ranking: tuple[CandidateScore, ...] = ()
     if choice.candidate == AUTO and sum(item.fitted is not None for item in assessed) > 1:
-        fitted = [item.fitted for item in assessed]
-        ranking = rank_candidates(fitted, so_far, seed=seed)
+        pictures = [item.fitted for item in assessed]
+        ranking = rank_candidates(pictures, so_far, seed=seed)
         if judge is not None and judge.config.candidates:
-            ranking = judge_candidates(judge, ranking, fitted, context, so_far)
+            ranking = judge_candidates(judge, ranking, pictures, context, so_far)
     chosen = ranking[0].candidate if ranking else _picked(assessed, choice, context)
     if ranking:
         logger.info("round %d: candidate %d: %s", context.round_number, chosen, ranking[0].reason)

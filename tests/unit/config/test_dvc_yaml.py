@@ -15,7 +15,7 @@ from sceneexpander.catalogue import METHODS, Kind, Method
 from sceneexpander.catalogue.methods import CORRECTED, methods_of
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.inference.config import RivalsConfig
-from sceneexpander.packages import LOCKS
+from sceneexpander.pipeline.packages import LOCKS
 from stages import layout
 from stages.fingerprint import stage_names
 
@@ -89,7 +89,7 @@ def filled(path: str) -> str:
                 layout.statistics("prepare", "S"),
             ],
         ),
-        ("reconstruct", [layout.state("S", 0), layout.statistics("reconstruct", "S")]),
+        ("reconstruct", [layout.state("S", 0), layout.match_memory("S"), layout.statistics("reconstruct", "S")]),
         ("generate_view", [layout.candidates("S", 2), layout.statistics("generate_view", "S", 2)]),
         ("choose_view", [layout.inserted("S", 2), layout.statistics("choose_view", "S", 2)]),
         (

@@ -27,9 +27,10 @@ from sceneexpander.errors import UserError
 from sceneexpander.generation.backends.reproject import fill_unseen, motion_of, seen_from_motion
 from sceneexpander.generation.config import ServiceConfig
 from sceneexpander.generation.protocol import Forecast, GenerationContext, SceneSoFar
-from sceneexpander.generation.service import Question, Reply, ServiceError, ServiceGenerator, plain_settings
+from sceneexpander.generation.service import Question, Reply, ServiceGenerator, plain_settings
 from sceneexpander.generation.start import CENTRAL
 from sceneexpander.ranges import Range, check_ranges
+from sceneexpander.services.transport import ServiceError
 
 Task = Literal["edit", "inpaint"]
 Precision = Literal["float32", "float16", "bfloat16"]
