@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sceneexpander.artifacts.inserted import CandidateScore
+from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.artifacts.store import read_json, read_typed, write_json_atomic
 from sceneexpander.artifacts.views import to_uint8
 from sceneexpander.config.compose import compose

@@ -34,6 +34,7 @@ SECTIONS = (
     "frontend",
     "warmup",
     "adapt",
+    "corrections",
     "refine",
     "optimise",
     "render",

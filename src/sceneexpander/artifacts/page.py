@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.artifacts.cameras import CameraReport
-from sceneexpander.artifacts.inserted import CandidateScore
 from sceneexpander.artifacts.proposals import Proposals
 from sceneexpander.artifacts.store import ArtifactError, check_inside, read_json, read_typed, write_json_atomic
 

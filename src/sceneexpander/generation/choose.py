@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor
 
+from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.artifacts.candidates import Candidate
-from sceneexpander.artifacts.inserted import CandidateScore, InsertedView
+from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.errors import UserError
 from sceneexpander.generation.assess import Assessed, assess

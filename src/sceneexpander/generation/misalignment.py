@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.artifacts.inserted import MisalignmentReport
+from sceneexpander.artifacts.agreement import MisalignmentReport
 from sceneexpander.frontend.bundle import LOG_FOCAL
 from sceneexpander.frontend.resection import ResectedView, Sighting, resect
 from sceneexpander.generation.protocol import SceneSoFar

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sceneexpander.artifacts.inserted import CandidateScore
+from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.artifacts.judgement import HIGHEST_SCORE, LOWEST_SCORE
 from sceneexpander.generation.prompt import split_words
 from sceneexpander.generation.protocol import GenerationContext, SceneSoFar

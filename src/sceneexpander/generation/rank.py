@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.artifacts.inserted import CandidateScore
+from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.frontend.features import grey_u8
 from sceneexpander.generation.protocol import SceneSoFar
 from sceneexpander.generation.registration import FEWEST_INLIERS, PhotoPoints, detail_of, photo_points, register

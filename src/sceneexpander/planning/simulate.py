@@ -130,7 +130,7 @@ def _fake() -> Iterator[None]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _AllHeads(StepViews):
+class AllHeads(StepViews):
     """Views on which every head runs."""
 
     def predict(self, model: Reconstructor, heads: frozenset[Head] = ALL_HEADS) -> object:  # type: ignore[override]
@@ -139,7 +139,7 @@ class _AllHeads(StepViews):
 
 def _step_views(request: PlanRequest, model: Reconstructor, images: Tensor) -> StepViews:
     prepared = None if request.prepared is None else request.prepared(model, images)
-    kind = _AllHeads if request.all_heads else StepViews
+    kind = AllHeads if request.all_heads else StepViews
     return kind(images=images, priors=None, prepared=prepared, grids=[])
 
 

@@ -112,6 +112,8 @@ def test_a_number_has_a_range_and_nothing_just_outside_passes(way: Steps, hint: 
 @pytest.mark.parametrize("member", members_of(GeneratorConfig), ids=lambda member: member.__name__)
 def test_numbers_of_every_back_end_have_ranges(member: type) -> None:
     for way, _, declared in numbers(member):
+        if way == ("arguments",):
+            continue  # of another library's pipeline, which has its own opinion of them
         assert declared is not None, way
         assert math.isfinite(declared.low)
         assert math.isfinite(declared.high)

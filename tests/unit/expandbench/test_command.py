@@ -52,7 +52,7 @@ def test_all_studies_make_one_file_and_one_page(project: Path, monkeypatch: pyte
     results = Results.load(project / "results" / "ablation.json")
     assert set(results.studies) == {study.name for study in STUDIES}
     assert results.studies["predicted"].visits == 0 < results.studies["rows"].visits
-    assert {row.steps for row in results.studies["long"].rows.values()} == {0, 400}
+    assert {row.adapt.steps for row in results.studies["long"].rows.values()} == {0, 400}
     page = (project / "docs" / "ablation.md").read_text()
     assert "Not measured" not in page
     assert "old" not in page.split()
@@ -84,7 +84,7 @@ def test_a_table_of_ones_own_touches_neither(
     command(monkeypatch, ["--rows", "default", "--scenes", "test", "--seeds", "0"])
     shown = capsys.readouterr().out
     assert "8 test scenes" in shown
-    assert "| none | 8 | 30.00 |" in shown
+    assert "| default | 8 | 30.00 |" in shown
     assert (project / "docs" / "ablation.md").read_text() == before
     assert not (project / "results").exists()
 

@@ -142,7 +142,7 @@ def test_a_correction_of_another_package_runs_in_stages_and_benchmark(
     monkeypatch.setattr(bench._Worker, "_numbers", lambda _, scene, case: measured.append(scene))
     for row in (plain, MethodConfig(adapt=chosen.adapt, corrections=chosen.corrections)):
         worker._measured(GRADE, "toy", chosen.seed, row)
-    without, found = measured[0], measured[2]  # between them: the same weights alone
+    without, found = measured[1], measured[3]  # before each: the same weights alone
     torch.testing.assert_close(found.gaussians.opacities, 0.5 * without.gaussians.opacities)
 
     monkeypatch.chdir(tmp_path)
@@ -227,7 +227,8 @@ def test_nothing_of_the_truth_reaches_a_method_unless_the_grade_says_so(
     case = prepare_case(wrong, prepared, grade_named(grade), worker.loaded, s.frontend, tmp_path)
     right = worker.case(grade)
     moved = rotation_angle_deg(case.backbone.world_from_cam[-1, :3, :3], right.backbone.world_from_cam[-1, :3, :3])
-    assert (float(moved) > 5) is told
+    # The wrong camera that is told is noticed to contradict the pictures, and an estimate takes its place.
+    assert (float(moved) > 0.1) is told
     assert torch.equal(case.backbone.world_from_cam, right.backbone.world_from_cam) is not told
     assert torch.equal(case.inputs.joint_priors.depth, right.inputs.joint_priors.depth) is not told  # type: ignore[arg-type]
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneexpander.artifacts.inserted import InsertedView, MisalignmentReport, Provenance
+from sceneexpander.artifacts.agreement import MisalignmentReport
+from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.assess import frame_of

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sceneexpander.artifacts.inserted import CandidateScore
+from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.generation import GenerationContext, SceneSoFar
 from sceneexpander.generation.assess import frame_of

@@ -66,7 +66,7 @@ def test_every_view_gets_its_visits_however_many_there_are() -> None:
 
 def test_without_visits_it_is_the_start_itself() -> None:
     start = spoiled()
-    assert refine(start, IMAGES, RefineConfig(), seed=0) == (start, None)
+    assert refine(start, IMAGES, RefineConfig(visits=0), seed=0) == (start, None)
 
 
 def test_what_makes_it_worse_is_taken_back() -> None:
