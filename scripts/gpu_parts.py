@@ -536,7 +536,7 @@ def _drawn(scene: Scene, device: torch.device, backend: Backend, *, antialiased:
     )
     if out.depth is None:
         raise RuntimeError("no depth was drawn")
-    (out.rgb.movedim(1, -1)[0] * scene.target.to(device)).mean().backward()
+    (out.rgb.movedim(1, -1)[0] * scene.target.to(device)).mean().backward()  # type: ignore[no-untyped-call]
     values = {"rgb": out.rgb, "alpha": out.alpha, "depth": torch.where(out.alpha > 0.5, out.depth, 0)}
     for name, leaf in zip(
         ("means", "quats", "scales", "opacities", "colours", "screen"), [*leaves, screen], strict=True

@@ -24,7 +24,8 @@ class EarlierRegions(Measure):
         """Nothing inserted earlier in a first round."""
         made, records = subject.reconstruction, subject.views.records
         place_of = {record.view_id: place for place, record in enumerate(records)}
-        captured, inserted = [], []
+        captured: list[float] = []
+        inserted: list[float] = []
         for index, view_id in enumerate(made.view_ids):
             place = place_of[view_id]
             generated = bool(made.generated[index])

@@ -14,12 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.generation.backends.reproject import fill_unseen
-from sceneexpander.generation.motion import Step
+from sceneexpander.generation.motion import Direction, Step
 from sceneexpander.generation.protocol import SceneSoFar
 from sceneexpander.generation.start import CENTRAL, gaze_distance, moved_camera, start_view, upwards, view_distances
 from sceneexpander.geometry.camera import resize_intrinsics
 from sceneexpander.geometry.rigid import rigid_from_parts
-from sceneexpander.splatting.render import render
+from sceneexpander.splatting.render import Render, render
 
 COVERED_ALPHA = 0.5  # of what is drawn over a pixel: below it, nothing is known there
 FEWEST_SEEN = 0.4  # of a proposed picture, so that its camera can be found; set by hand
@@ -130,18 +130,20 @@ def measure_coverage(so_far: SceneSoFar) -> Coverage:
 
 
 def _motions() -> Iterable[tuple[Step, ...]]:
-    for direction in ("left", "right"):
+    sides: tuple[Direction, ...] = ("left", "right")
+    for direction in sides:
         for angle in _TURNS_DEG:
             yield (Step(kind="turn", direction=direction, amount=angle, unit="degrees"),)
         for angle in _ORBITS_DEG:
             yield (Step(kind="orbit", direction=direction, amount=angle, unit="degrees"),)
-    for direction in ("up", "down"):
+    tilts: tuple[Direction, ...] = ("up", "down")
+    for tilt in tilts:
         for angle in _UPS_DEG:
-            yield (Step(kind="turn", direction=direction, amount=angle, unit="degrees"),)
+            yield (Step(kind="turn", direction=tilt, amount=angle, unit="degrees"),)
     yield (Step(kind="move", direction="back", amount=_BACK, unit="share"),)
 
 
-def _drawn(so_far: SceneSoFar, pose: Float[Tensor, "4 4"], view: int, *, long_side_px: int):  # type: ignore[no-untyped-def]
+def _drawn(so_far: SceneSoFar, pose: Float[Tensor, "4 4"], view: int, *, long_side_px: int) -> Render:
     scene, views = so_far.reconstruction, so_far.views
     scale = min(1.0, long_side_px / max(views.height, views.width))
     height, width = round(views.height * scale), round(views.width * scale)

@@ -70,13 +70,16 @@ def rounds_shown(
         before: of the captured scene.
         names: of the views, for people.
     """
-    measured = [("before", before, None)] if before is not None else []
+    measured: list[tuple[str, MetricsRow | None, RoundPage | None]] = []
+    if before is not None:
+        measured.append(("before", before, None))
     measured += [(f"round {item.number}", row, item) for item, row in zip(rounds, rows, strict=True) if row is not None]
     if not any(item is not None for _, _, item in measured):
         return None
     kinds = {view.view_id: view.generated for _, row, _ in measured if row is not None for view in row.views}
     first: dict[str, float] = {}
-    shown, drifts = [], []
+    shown: list[HeatRow] = []
+    drifts: list[tuple[int, float]] = []
     for label, row, page in measured:
         values = {view.view_id: view_psnr(view) for view in row.views} if row is not None else {}
         older = [value - first[view] for view, value in values.items() if value is not None and view in first]
