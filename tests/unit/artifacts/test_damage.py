@@ -123,6 +123,7 @@ def save_page(folder: Path) -> None:
         unavailable=(MissingMethod(name="ttt3r", model="ttt3r", reason="r", metrics="n.json"),),
         steps=Steps(inserted=(True, False), values={"loss": (1.0, 2.0)}),
         looks=LooksPage(identity="abc", looks=(look,), warnings=()), cameras=camera_report(), problems="cameras.txt",
+        proposals=None,
         judgement=Judgement(overlap=0.5, depth_conflict=None, colour_conflict=0.1, cameras_moved_deg=0.0, reasons=()),
         statistics={"adapt": StageRun(started=1.0, wall_s=2.0, peak_rss_mb=3.0)}, warnings=("w",),
     )  # fmt: skip
