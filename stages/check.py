@@ -6,8 +6,8 @@ from pathlib import Path
 
 from sceneexpander.config.overrides import written_out
 from sceneexpander.errors import entry_point
-from sceneexpander.packages import installed_packages
-from sceneexpander.preflight import Checked, check_scene
+from sceneexpander.pipeline.packages import installed_packages
+from sceneexpander.pipeline.preflight import Checked, check_scene
 from sceneexpander.selection import read_selection
 from stages import layout
 from stages.resolve import CONF
@@ -26,6 +26,7 @@ def main() -> None:
             conf=CONF,
             overrides=written_out(selection.overrides),
             rounds=selection.rounds,
+            round_overrides=[written_out(more) for more in selection.round_overrides],
             methods=selection.methods,
             checked=checked,
         )

@@ -23,8 +23,14 @@ class Sections:
 
     seed: int
     threads: int
-    choose: ChoiceConfig
     judge: JudgeConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoundSections:
+    """What it reads of its round's."""
+
+    choose: ChoiceConfig
 
 
 @stage("scene", "round", "previous")
@@ -32,12 +38,13 @@ def main(cell: Cell) -> None:
     """Check, rank, choose; the contact sheet shows all candidates, the overlay how the chosen one goes with the scene."""
     sections = read_sections(layout.config(cell.scene), Sections)
     use_machine(sections.threads)
+    of_round = read_sections(layout.round_settings(cell.scene), RoundSections, within=layout.round_key(cell.round))
     made = CandidateSet.load(layout.candidates(cell.scene, cell.round))
     chosen = choose_view(
         generation_context(cell),
         made.candidates,
         scene_so_far(cell),
-        sections.choose,
+        of_round.choose,
         seed=sections.seed,
         judge=make_judge(sections.judge, project_root() / JUDGED_FOLDER),
     )

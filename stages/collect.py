@@ -16,9 +16,10 @@ from stages.resolve import read_overrides
 from stages.runner import Cell, stage
 
 
-def _round(scene: str, number: int, methods: Sequence[str]) -> RoundSource:
+def _round(scene: str, number: int, methods: Sequence[str], *, last: bool) -> RoundSource:
     return RoundSource(
         number=number,
+        asked=layout.asked(scene, number),
         inserted=layout.inserted(scene, number),
         methods=[
             MethodSource(
@@ -35,6 +36,7 @@ def _round(scene: str, number: int, methods: Sequence[str]) -> RoundSource:
         log=layout.state(scene, number) / "log.json",
         statistics=layout.round_folder(scene, number) / "stats",
         cameras=layout.cameras(layout.joint_priors(scene, number)),
+        proposals=layout.proposals(scene, number) if last else None,
         judged=layout.judged(scene, number),
     )
 
@@ -63,7 +65,10 @@ def main(cell: Cell) -> None:
         scene=layout.prepared(cell.scene),
         report=layout.state(cell.scene, 0) / "report.json",
         statistics=layout.OUTPUTS / cell.scene / "stats",
-        rounds=[_round(cell.scene, number, selected.methods) for number in range(1, selected.rounds + 1)],
+        rounds=[
+            _round(cell.scene, number, selected.methods, last=number == selected.rounds)
+            for number in range(1, selected.rounds + 1)
+        ],
         settings=flatten(config),
         overrides=read_overrides(Path("params.yaml")),
         cameras=layout.cameras(layout.state(cell.scene, 0)),

@@ -43,17 +43,18 @@ def main(cell: Cell) -> None:
     from sceneexpander.artifacts.inserted import InsertedView
     from sceneexpander.artifacts.reconstruction import Reconstruction
     from sceneexpander.artifacts.renders import Renders
+    from sceneexpander.artifacts.truth import SceneTruth
     from sceneexpander.artifacts.views import ViewSet
     from sceneexpander.evaluation.evaluate import evaluate
     from sceneexpander.evaluation.measure import Navigation
     from sceneexpander.evaluation.repeats import over_repeats
-    from sceneexpander.evaluation.truth import load_truth
     from stages.machine import use_machine
 
     use_machine(sections.threads)
     before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
     views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
     renders = Renders.load(layout.renders(cell.scene, cell.round, cell.method))
+    truth = SceneTruth.load(layout.truth(cell.scene))
     runs = [made, *sorted(made.parent.glob(layout.REPEATS))]
     rows = [
         evaluate(
@@ -69,7 +70,7 @@ def main(cell: Cell) -> None:
                 height=renders.height,
                 width=renders.width,
             ),
-            truth=load_truth(layout.source(cell.scene)),
+            truth=truth if truth.views else None,
             fit=fit_of(cell),
         )
         for run in runs

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.environment import find_environment
-from sceneexpander.fingerprint import SourceTree
+from sceneexpander.pipeline.fingerprint import SourceTree
 from stages import layout
 from stages.runner import Cell, stage
 

@@ -18,6 +18,12 @@ class Sections:
     """What this stage reads of the configuration."""
 
     threads: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoundSections:
+    """What it reads of its round's."""
+
     generator: GeneratorConfig
 
 
@@ -26,7 +32,8 @@ def main(cell: Cell) -> None:
     """Ask the back-end, and keep what came with the record of where it came from."""
     sections = read_sections(layout.config(cell.scene), Sections)
     use_machine(sections.threads)
-    made = make_generator(sections.generator).generate(generation_context(cell), scene_so_far(cell))
+    of_round = read_sections(layout.round_settings(cell.scene), RoundSections, within=layout.round_key(cell.round))
+    made = make_generator(of_round.generator).generate(generation_context(cell), scene_so_far(cell))
     with directory_being_written(layout.candidates(cell.scene, cell.round)) as folder:
         made.save(folder)
 

@@ -16,6 +16,7 @@ CODE = OUTPUTS / "code.json"
 GIVEN = OUTPUTS / "given"  # links to files that the configuration names, by scene
 ENVIRONMENT = OUTPUTS / "environment.json"  # that the hashes in CODE belong to
 REPEATS = "repeat_*"
+RECORDED = "recorded"  # in a round's folder of what was asked for: a copy of the pictures that scene.yaml names
 REFINEMENT = "refinement.json"  # beside a reconstruction whose Gaussians were refined: what it changed
 
 
@@ -37,7 +38,7 @@ def selection(scene: str) -> Path:
 def given(scene: str, kind: str) -> Path:
     """A folder of links to files that the configuration names, wherever they are: the pipeline depends on their bytes.
 
-    ``kind``: ``generator`` and ``choice`` (a link per round), ``judge`` (a prompt per criterion), ``model`` (weights), or a rival's name
+    ``kind``: ``generator`` and ``choice`` (a folder per round), ``judge`` (a prompt per criterion), ``model`` (weights), or a rival's name
     (weights).
     """
     return GIVEN / scene / kind
@@ -46,6 +47,31 @@ def given(scene: str, kind: str) -> Path:
 def prepared(scene: str) -> Path:
     """The `Scene` artefact."""
     return OUTPUTS / scene / "scene"
+
+
+def asked(scene: str, number: int) -> Path:
+    """The `RoundSpec` of a round, and in `RECORDED` the pictures that it names."""
+    return OUTPUTS / scene / "asked" / f"round_{number}"
+
+
+def round_settings(scene: str) -> Path:
+    """How the picture of each round is obtained: sections by `round_key`, apart from `config` so that rounds share nothing here."""
+    return OUTPUTS / scene / "rounds.yaml"
+
+
+def round_key(number: int) -> str:
+    """Of a round's sections in `round_settings`, and its folder of given files."""
+    return f"round_{number}"
+
+
+def proposals(scene: str, number: int) -> Path:
+    """The `Proposals` after a round."""
+    return round_folder(scene, number) / "proposals"
+
+
+def truth(scene: str) -> Path:
+    """What is known of the truth, a `SceneTruth`; empty without any."""
+    return OUTPUTS / scene / "truth"
 
 
 def round_folder(scene: str, number: int) -> Path:

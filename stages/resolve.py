@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from sceneexpander.environment import usable_cpus
 from sceneexpander.generation.config import ChoiceConfig, GeneratorConfig
 from sceneexpander.judge.config import JudgeConfig
 from sceneexpander.models.weights import named_file
-from sceneexpander.selection import read_selection
+from sceneexpander.selection import ROUND_SECTIONS, read_selection
 from sceneexpander.typed import decode_dataclass
 from stages import layout
 from stages.runner import Cell, stage
@@ -33,21 +33,25 @@ def read_methods(path: Path) -> list[str]:
     return list(read_selection(path.parent).methods)
 
 
-def named_files(values: Mapping[str, Any], rounds: int) -> dict[str, dict[str, Path]]:
-    """Files from outside that a configuration names: by kind (see `layout.given`), then by the name of their link.
+def named_files(values: Mapping[str, Any], rounds: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Path]]:
+    """Files from outside that a configuration names: by kind and for some by round (see `layout.given`), then by the name of their link.
 
     Files that are not there are left out: the stage that needs one says so. Weights on a hub are named by their revision.
+
+    Args:
+        values: of the composed configuration.
+        rounds: sections of each round.
     """
-    generator = decode_dataclass(GeneratorConfig, values["generator"])
-    choice = decode_dataclass(ChoiceConfig, values["choose"])
     judge = decode_dataclass(JudgeConfig, values["judge"])
-    numbers = range(1, rounds + 1)
     found: dict[str, dict[str, Path | None]] = {
-        "generator": {f"round_{number}": generator.named_file(number) for number in numbers},
-        "choice": {f"round_{number}": choice.named_file(number) for number in numbers},
         "judge": dict(judge.named_files()),
         "model": {"weights": named_file(values["model"]["weights"])},
     }
+    for number, sections in enumerate(rounds, start=1):
+        generator = decode_dataclass(GeneratorConfig, sections["generator"])
+        choice = decode_dataclass(ChoiceConfig, sections["choose"])
+        found[f"generator/{layout.round_key(number)}"] = {"file": generator.named_file(number)}
+        found[f"choice/{layout.round_key(number)}"] = {"file": choice.named_file(number)}
     for rival, section in values["rivals"].items():
         found[rival] = {"weights": named_file(section["weights"])}
     return {
@@ -71,11 +75,20 @@ def link_files(files: Mapping[str, Path], folder: Path) -> None:
 def main(cell: Cell) -> None:
     """Compose, validate, write; link the files that it names; note for every method that is not always made whether it is wanted."""
     methods = read_methods(Path("params.yaml"))
+    selected = read_selection(Path())
     overrides = [f"scene={scene_option(CONF, cell.scene)}", *read_overrides(Path("params.yaml"))]
     values = compose(CONF, overrides)
     values["threads"] = values["threads"] or usable_cpus()
     write_yaml(layout.config(cell.scene), values)
-    rounds = read_selection(Path()).rounds
+    rounds = []
+    for number in range(1, selected.rounds + 1):
+        more = written_out(selected.overrides_of(number))
+        of_round = compose(CONF, [*overrides, *more]) if more else values
+        rounds.append({name: of_round[name] for name in ROUND_SECTIONS})
+    keys = map(layout.round_key, range(1, len(rounds) + 1))
+    write_yaml(layout.round_settings(cell.scene), dict(zip(keys, rounds, strict=True)))
+    for kind in ("generator", "choice"):
+        shutil.rmtree(layout.given(cell.scene, kind), ignore_errors=True)  # of rounds that are no more
     for kind, files in named_files(values, rounds).items():
         link_files(files, layout.given(cell.scene, kind))
     write_yaml(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.scene import Scene
+from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.state import ExpansionState
 from sceneexpander.generation import GenerationContext, SceneSoFar
 from sceneexpander.project import GENERATED_FOLDER
@@ -13,14 +13,16 @@ from stages.runner import Cell, project_root
 
 def generation_context(cell: Cell) -> GenerationContext:
     """The round as it is known before anything runs."""
+    asked = layout.asked(cell.scene, cell.round)
     scene = Scene.load(layout.prepared(cell.scene))
     return GenerationContext(
         scene_folder=layout.source(cell.scene),
         scene=cell.scene,
         round_number=cell.round,
-        spec=scene.round_spec(cell.round),
+        spec=RoundSpec.load(asked),
         captured=scene.views,
         cache=project_root() / GENERATED_FOLDER,
+        recorded=asked / layout.RECORDED,
     )
 
 

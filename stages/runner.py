@@ -28,7 +28,7 @@ from sceneexpander.artifacts.store import (
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, disk_full, interruptible
-from sceneexpander.packages import installed_packages
+from sceneexpander.pipeline.packages import installed_packages
 from sceneexpander.processes import end_with_parent
 from sceneexpander.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
 from stages import layout

@@ -31,7 +31,7 @@ from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, 
 from sceneexpander.expandbench.scenes import DEVELOPMENT, SCENES, TEST
 from sceneexpander.expandbench.studies import BEYOND, CONTROLS, STUDIES, TABLE, Study
 from sceneexpander.expansion import MethodConfig
-from sceneexpander.fingerprint import SourceTree
+from sceneexpander.pipeline.fingerprint import SourceTree
 from sceneexpander.project import find_project
 
 GRADES_BY_DEFAULT = ("mixed_2",)

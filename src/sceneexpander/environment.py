@@ -8,8 +8,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneexpander.fingerprint import SourceTree
-from sceneexpander.packages import installed_packages
+from sceneexpander.pipeline.fingerprint import SourceTree
+from sceneexpander.pipeline.packages import installed_packages
 
 _RENDERER = "sceneexpander.splatting.kernel_backend"
 

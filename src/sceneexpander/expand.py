@@ -3,11 +3,12 @@
 ``PHOTOS`` is a folder of photos, a scene folder with a ``scene.yaml``, a video, a COLMAP model, a ``transforms.json``, or what else
 `sceneexpander.ingest.sources` reads. The picture beyond their boundary is your own (``--inserted``),
 or made from the words (``--generator``). Runs in ``runs/NAME`` and prints where the report is. Methods and settings are those of the
-project's params.yaml; ``key=value`` adds to them.
+project's params.yaml; ``key=value`` adds to them. ``--continue NAME`` goes on from a finished run, see `sceneexpander.growing`.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -35,15 +36,15 @@ from sceneexpander.ingest.sources import read_capture
 from sceneexpander.ingest.sources.posed import write_posed_photos
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.locks import run_lock
+from sceneexpander.pipeline.preflight import check_scene
+from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, reproduce
 from sceneexpander.plainfiles import require_plain_file
-from sceneexpander.preflight import check_scene
 from sceneexpander.processes import ended_by_signals
 from sceneexpander.project import find_project
 from sceneexpander.report.cameras import camera_lines
 from sceneexpander.selection import Selection, check_name, read_selection
-from sceneexpander.workspace import make_workspace, merged_overrides, reproduce
 
-_NO_PICTURE = "give one --inserted PICTURE for each round, or have them made: --generator reproject, openai, ..."
+NO_PICTURE = "give one --inserted PICTURE for each round, or have them made: --generator reproject, openai, ..."
 SCENE_FILE = "scene.yaml"
 SOURCE_FILE = "source.json"  # in a run's folder: which photos it is of
 
@@ -71,12 +72,16 @@ def make_parser() -> CommandParser:
         examples=[
             '~/pictures/terrace --inserted bench.png --prompt "Behind the white table is a wooden bench."',
             "~/scenes/terrace --name try_2 profile=smoke adapt.steps=50",
+            '--continue terrace --generator reproject --motion "turn left 30 degrees"',
+            "--continue terrace --propose",
+            '--continue terrace --from-round 1 --as terrace_lake --inserted lake.png --prompt "To the left is a lake."',
         ],
     )
     parser.add_argument(
         "photos",
         type=Path,
         metavar="PHOTOS",
+        nargs="?",
         help="folder of photos, scene folder with scene.yaml, video, COLMAP model, transforms.json",
     )
     parser.add_argument("--inserted", type=Path, action="append", default=[], help="picture to insert, one per round")
@@ -89,6 +94,14 @@ def make_parser() -> CommandParser:
     parser.add_argument("--yes", action="store_true", help="send requests that cost something without asking")
     parser.add_argument("--dry-run", action="store_true", help="print what would be asked for, and stop")
     parser.add_argument("--name", help="name of the run (default: the folder's)")
+    parser.add_argument("--continue", dest="continued", metavar="NAME", help="add a round to this finished run")
+    parser.add_argument("--undo", action="store_true", help="with --continue: take its last round away")
+    parser.add_argument("--propose", action="store_true", help="with --continue: print motions that show something new")
+    parser.add_argument("--from-round", type=int, metavar="K", help="with --continue and --as: the round to go on from")
+    parser.add_argument(
+        "--as", dest="branch", metavar="NEWNAME", help="with --continue: a run of its own for what follows"
+    )
+    parser.add_argument("--anyway", action="store_true", help="with --continue: also after a round that failed")
     # No default: argparse would count settings, of which there may be none, among the arguments that are missing.
     parser.add_argument(
         "overrides", nargs="*", metavar="key=value", default=[], help="configuration, e.g. profile=smoke"
@@ -96,18 +109,60 @@ def make_parser() -> CommandParser:
     return parser
 
 
-def parse_arguments(arguments: Sequence[str]) -> Request:
-    """The command line as a `Request`."""
-    given = make_parser().parse_intermixed_args(list(arguments))
-    for override in given.overrides:
-        if "=" not in override:
-            raise UserError("is not a setting", where=override, fix="write key=value, e.g. profile=smoke")
+def read_arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    """The command line, options that belong together checked.
+
+    Raises:
+        UserError: photos or --continue are missing, or an option has no meaning with the others.
+    """
+    parser = make_parser()
+    given = parser.parse_intermixed_args(list(arguments))
+    if given.continued is None:
+        of_runs = {"--undo": given.undo, "--propose": given.propose, "--from-round": given.from_round is not None}
+        of_runs |= {"--as": given.branch is not None, "--anyway": given.anyway}
+        for option, used in of_runs.items():
+            if used:
+                raise UserError("belongs to a finished run", where=option, fix="name it with --continue")
+        if given.photos is None:
+            parser.error("the following arguments are required: PHOTOS")
+        return given
+    if given.photos is not None:
+        raise UserError("a run goes on with its own photos and settings", where=str(given.photos), fix="leave it out")
+    if given.name is not None:
+        raise UserError("is the name of a new run", where="--name", fix="--as names what goes another way")
+    words = {"--inserted": given.inserted, "--prompt": given.prompt, "--motion": given.motion, "--object": given.object}
+    for option, values in words.items():
+        if len(values) > 1:
+            raise UserError("rounds are added one by one", where=option, fix="give it once")
+    adding = [option for option, values in words.items() if values]
+    adding += ["--generator"] * bool(_settings(given)) + ["--as"] * (given.branch is not None)
+    if given.undo and (adding or given.propose or given.from_round is not None):
+        raise UserError("only takes the last round away", where="--undo", fix="leave out the other options")
+    if given.propose and adding:
+        raise UserError("only prints motions", where="--propose", fix=f"leave out {adding[0]}")
+    return given
+
+
+def _settings(given: argparse.Namespace) -> tuple[str, ...]:
+    """How pictures are obtained, as overrides."""
     options = {
         "generator": given.generator,
         "generator.candidates": given.candidates,
         "choose.candidate": given.choose,
     }
-    settings = [f"{key}={value}" for key, value in options.items() if value is not None]
+    return tuple(f"{key}={value}" for key, value in options.items() if value is not None)
+
+
+def parse_arguments(arguments: Sequence[str]) -> Request:
+    """The command line as a `Request`."""
+    return request_of(read_arguments(arguments))
+
+
+def request_of(given: argparse.Namespace) -> Request:
+    """What was given for a folder of photos."""
+    for override in given.overrides:
+        if "=" not in override:
+            raise UserError("is not a setting", where=override, fix="write key=value, e.g. profile=smoke")
     return Request(
         photos=given.photos,
         inserted=tuple(given.inserted),
@@ -115,7 +170,7 @@ def parse_arguments(arguments: Sequence[str]) -> Request:
         motions=tuple(given.motion),
         objects=tuple(given.object),
         name=given.name,
-        overrides=(*settings, *given.overrides),
+        overrides=(*_settings(given), *given.overrides),
         unattended=given.yes,
         dry_run=given.dry_run,
     )
@@ -169,11 +224,11 @@ def stage_scene(
             source = request.inserted[k]
             require_plain_file(source)
             read_picture(source, max_megapixels=ingest.max_megapixels)
-            copy = _inserted_name(k + 1, source)
+            copy = inserted_name(k + 1, source)
             _copy(source, target / copy)
             facts["inserted"] = copy.as_posix()
         elif recorded:
-            raise UserError(f"round {k + 1} has no picture", where="--inserted", fix=_NO_PICTURE)
+            raise UserError(f"round {k + 1} has no picture", where="--inserted", fix=NO_PICTURE)
         rounds.append(facts)
     # The copy holds nothing but photos: what else was there is told by the notes alone.
     content = {"name": name, "rounds": rounds, **({"notes": list(capture.notes)} if capture.notes else {})}
@@ -181,7 +236,7 @@ def stage_scene(
     (target / SCENE_FILE).write_text(text, encoding="utf-8")
 
 
-def _inserted_name(number: int, source: Path) -> Path:
+def inserted_name(number: int, source: Path) -> Path:
     """Where the picture of a round lies in a scene folder.
 
     The content decides what it is: an ending is for people, and may be as odd or long as the whole name.
@@ -238,11 +293,14 @@ def check_source(folder: Path, request: Request) -> None:
     """Raise `UserError` if the run in ``folder`` is of other photos: two folders may have one name, or names reduced to one."""
     try:
         known: dict[str, Any] = json.loads((folder / SOURCE_FILE).read_text(encoding="utf-8"))
-        photos = Path(known["photos"])
+        photos, branch_of = Path(known["photos"]), known.get("branch_of")
     except FileNotFoundError:
         return
     except (OSError, ValueError, KeyError, TypeError):
         raise UserError("is damaged", where=folder / SOURCE_FILE, fix="choose another --name") from None
+    if branch_of is not None:
+        fix = "choose another --name, or go on with --continue"
+        raise UserError(f"is a branch of the run {branch_of}", where=folder, fix=fix)
     if photos != _identity(request):
         raise UserError(f"holds another folder's scene ({photos})", where=folder, fix="choose another --name")
 
@@ -260,7 +318,7 @@ def _check_words(request: Request) -> None:
 
 
 @contextmanager
-def _scratch(folder: Path) -> Iterator[Path]:
+def scratch_folder(folder: Path) -> Iterator[Path]:
     """A folder on the run's disk, so that what is put together there need not be copied again. Earlier ones of killed runs go."""
     for left in folder.parent.glob(f".{folder.name}.*.part"):
         remove_tree(left)
@@ -292,7 +350,7 @@ def expand(request: Request, *, project: Path) -> Path | None:
     # The lock comes first: nothing may change in a folder that another process works on.
     with run_lock(folder) as lock:
         check_source(folder, request)
-        with _scratch(folder) as scratch:
+        with scratch_folder(folder) as scratch:
             scene = scratch / name
             with _shown_as_given(scene, request):
                 stage_scene(request, name, scene, ingest=config.scene, recorded=recorded)
@@ -310,9 +368,9 @@ def expand(request: Request, *, project: Path) -> Path | None:
     return folder / "outputs" / "report" / "index.html"
 
 
-def announce_forecasts(forecasts: Sequence[Forecast], backend: str, *, details: bool) -> None:
-    """Print what a run would ask of a generator; without ``details`` only what a user must know."""
-    for number, forecast in enumerate(forecasts, start=1):
+def announce_forecasts(forecasts: Sequence[Forecast], backend: str, *, details: bool, first: int = 1) -> None:
+    """Print what a run would ask of a generator for rounds from ``first`` on; without ``details`` only what a user must know."""
+    for number, forecast in enumerate(forecasts, start=first):
         if details:
             print(f"round {number}: generator {backend}")
             print(f"  prompt: {printable(forecast.prompt)}")
@@ -366,7 +424,7 @@ def _shown_as_given(scene: Path, request: Request) -> Iterator[None]:
     except UserError as error:
         originals: dict[Path, Path] = {}
         if not (request.photos / SCENE_FILE).is_file():
-            originals |= {scene / _inserted_name(k, path): path for k, path in enumerate(request.inserted, start=1)}
+            originals |= {scene / inserted_name(k, path): path for k, path in enumerate(request.inserted, start=1)}
             originals[scene / "captured"] = request.photos
         where, problem = error.where or "", error.problem
         for copy, original in {**originals, scene: request.photos}.items():
@@ -377,10 +435,23 @@ def _shown_as_given(scene: Path, request: Request) -> Iterator[None]:
 @entry_point
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    request = parse_arguments(sys.argv[1:] if arguments is None else arguments)
+    # It builds on this module.
+    from sceneexpander import growing
+
+    given = read_arguments(sys.argv[1:] if arguments is None else arguments)
+    project = find_project()
+    if given.propose:
+        for line in growing.proposal_lines(given.continued, given.from_round, project=project):
+            print(printable(line))
+        return
     try:
         with ended_by_signals():
-            page = expand(request, project=find_project())
+            if given.continued is None:
+                page = expand(request_of(given), project=project)
+            elif given.undo:
+                page = growing.undo_round(given.continued, project=project)
+            else:
+                page = growing.add_round(given.continued, growing.round_of(given, _settings(given)), project=project)
             if page is None:
                 return
     except RuntimeError as error:
@@ -389,7 +460,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     folder = page.parents[2]
     selection = read_selection(folder)
     chosen = choice_lines(folder, selection.scenes[0], selection.rounds)
-    for line in [*camera_lines(page.parents[1]), *chosen]:
+    failed = growing.last_quality_line(folder)
+    for line in [*camera_lines(page.parents[1]), *chosen, *([] if failed is None else [failed])]:
         print(printable(line))
     print(f"report: {page}")
 

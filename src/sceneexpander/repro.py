@@ -11,9 +11,9 @@ import sys
 from sceneexpander.errors import entry_point
 from sceneexpander.pipeline.disk import require_room
 from sceneexpander.pipeline.locks import run_lock
+from sceneexpander.pipeline.surroundings import pipeline_environment, settle_project
 from sceneexpander.processes import run_group
 from sceneexpander.project import find_project
-from sceneexpander.surroundings import pipeline_environment, settle_project
 
 
 @entry_point

@@ -22,6 +22,7 @@ RESERVED = frozenset(
     {"pages", "report", "given", "code.json", "environment.json"}
 )  # in outputs/, where every scene has a folder of its name
 MOST_ROUNDS = 100
+ROUND_SECTIONS = ("generator", "choose")  # of the configuration, that a round may have of its own
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 _KEYS = ("scenes", "rounds", "methods", "overrides")
 
@@ -36,6 +37,7 @@ class Selection:
         previous: of each round, the one that it goes on from; empty: the one before.
         methods: rows of the tables.
         overrides: Hydra overrides as they were written.
+        round_overrides: of each round, further ones of `ROUND_SECTIONS`; empty: no round has any.
     """
 
     scenes: tuple[str, ...]
@@ -43,13 +45,21 @@ class Selection:
     previous: tuple[int, ...] = ()
     methods: tuple[str, ...] = tuple(method.name for method in METHODS if method.always_made)
     overrides: tuple[str, ...] = ()
+    round_overrides: tuple[tuple[str, ...], ...] = ()
+
+    def overrides_of(self, number: int) -> tuple[str, ...]:
+        """Overrides that round ``number`` (from 1) alone has."""
+        return self.round_overrides[number - 1] if self.round_overrides else ()
 
     def to_yaml(self) -> str:
         """The text of params.yaml."""
         previous = self.previous or tuple(range(self.rounds))
         content = {
             "scenes": list(self.scenes),
-            "rounds": [{"k": k, "prev": earlier} for k, earlier in enumerate(previous, start=1)],
+            "rounds": [
+                {"k": k, "prev": earlier, **({"overrides": list(more)} if (more := self.overrides_of(k)) else {})}
+                for k, earlier in enumerate(previous, start=1)
+            ],
             "methods": list(self.methods),
             "overrides": list(self.overrides),
         }
@@ -72,10 +82,12 @@ def read_selection(project: Path) -> Selection:
     for key in _KEYS:
         if key not in raw:
             raise UserError(f"does not select a run ({key!r} is missing)", where=path)
+    rounds = _list(raw, "rounds", path)
     return Selection(
         scenes=_scenes(_list(raw, "scenes", path), f"{path}: scenes"),
-        rounds=len(_list(raw, "rounds", path)),
-        previous=_previous(_list(raw, "rounds", path), f"{path}: rounds"),
+        rounds=len(rounds),
+        previous=_previous(rounds, f"{path}: rounds"),
+        round_overrides=_round_overrides(rounds, f"{path}: rounds"),
         methods=_methods(_list(raw, "methods", path), f"{path}: methods"),
         overrides=_texts(_list(raw, "overrides", path, may_be_empty=True), f"{path}: overrides", "adapt.steps=5"),
     )
@@ -139,7 +151,7 @@ def _previous(items: list[Any], where: str) -> tuple[int, ...]:
         raise UserError(f"are {len(items)}, more than the {MOST_ROUNDS} allowed", where=where)
     previous = []
     for number, item in enumerate(items, start=1):
-        if not isinstance(item, dict) or set(item) != {"k", "prev"}:
+        if not isinstance(item, dict) or set(item) - {"overrides"} != {"k", "prev"}:
             raise UserError(f"entry {number} is {_shown(item)}", where=where, fix=fix)
         k, earlier = item["k"], item["prev"]
         if type(k) is not int or k != number:  # not True, which is 1 to Python
@@ -149,6 +161,22 @@ def _previous(items: list[Any], where: str) -> tuple[int, ...]:
             raise UserError(problem, where=where, fix=fix)
         previous.append(earlier)
     return () if previous == list(range(len(previous))) else tuple(previous)
+
+
+def _round_overrides(items: list[dict[str, Any]], where: str) -> tuple[tuple[str, ...], ...]:
+    """Of every round its own overrides, which may say how its picture is obtained and nothing else."""
+    found = []
+    for number, item in enumerate(items, start=1):
+        own = item.get("overrides", [])
+        place = f"{where}: round {number}: overrides"
+        if not isinstance(own, list):
+            raise UserError(f"holds {_shown(own)}, expected a list", where=place)
+        for override in _texts(own, place, "generator=reproject"):
+            if re.split(r"[.=]", override.lstrip("+~"), maxsplit=1)[0] not in ROUND_SECTIONS:
+                problem = f"{override!r} is for all rounds"
+                raise UserError(problem, where=place, fix=f"only {' and '.join(ROUND_SECTIONS)} can be a round's own")
+        found.append(tuple(own))
+    return tuple(found) if any(found) else ()
 
 
 def _shown(value: object) -> str:

@@ -20,12 +20,12 @@ from sceneexpander.config.overrides import environment_hidden, key_of, written_o
 from sceneexpander.config.parse import ConfigError
 from sceneexpander.errors import UserError, did_you_mean, disk_full, entry_point
 from sceneexpander.pipeline.disk import remove_tree
-from sceneexpander.preflight import CHECKED_SECTIONS, Checked, check_scene
+from sceneexpander.pipeline.preflight import CHECKED_SECTIONS, Checked, check_scene
+from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, reproduce_shared
 from sceneexpander.processes import run_group
 from sceneexpander.project import ROOT_ENV, find_project
 from sceneexpander.selection import Selection, read_selection
 from sceneexpander.typed import shorten
-from sceneexpander.workspace import make_workspace, merged_overrides, reproduce_shared
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override
@@ -86,6 +86,7 @@ def _check(selection: Selection, project: Path, *, device: bool = True) -> None:
             conf=project / "conf",
             overrides=selection.overrides,
             rounds=selection.rounds,
+            round_overrides=selection.round_overrides,
             methods=selection.methods,
             device=device,
             checked=_CHECKED,

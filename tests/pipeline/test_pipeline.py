@@ -21,8 +21,8 @@ from PIL import Image
 
 from sceneexpander.catalogue import METHODS as KNOWN
 from sceneexpander.catalogue.methods import CORRECTED
+from sceneexpander.pipeline.workspace import make_workspace, workspace_environment
 from sceneexpander.selection import Selection
-from sceneexpander.workspace import make_workspace, workspace_environment
 from stages import layout
 
 pytestmark = pytest.mark.pipeline
@@ -108,7 +108,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
     project = Project(tmp_path_factory.mktemp("pipeline") / "project")
     executed = project.repro()
     assert executed[0] == "code"
-    assert len(executed) == 32, executed
+    assert len(executed) == 33, executed
     yield project
     shutil.rmtree(project.folder, ignore_errors=True)
 
@@ -325,7 +325,7 @@ def test_expand_runs_a_folder_of_photos(finished: Project) -> None:
 
 def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_path: Path) -> None:
     """A sweep's jobs: what another run has made is restored, not made again."""
-    from sceneexpander.workspace import reproduce_shared
+    from sceneexpander.pipeline.workspace import reproduce_shared
 
     selection = Selection(scenes=("room",), rounds=1, overrides=(*SMOKE, "ablation=restore_interval_1"))
     folder = make_workspace(tmp_path / "job", selection, project=finished.folder)

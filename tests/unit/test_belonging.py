@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from sceneexpander import packages
 from sceneexpander.catalogue import METHODS, Kind
 from sceneexpander.catalogue.methods import methods_of
 from sceneexpander.environment import Environment
 from sceneexpander.errors import UserError
-from sceneexpander.fingerprint import SourceTree
-from sceneexpander.packages import LOCKS, installed_packages
-from sceneexpander.selection import Selection
+from sceneexpander.pipeline import packages
+from sceneexpander.pipeline.fingerprint import SourceTree
+from sceneexpander.pipeline.packages import LOCKS, installed_packages
+from sceneexpander.selection import ROUND_SECTIONS, Selection
 from stages import layout, runner
 from stages.fingerprint import stage_names
 from stages.resolve import link_files, named_files
@@ -33,8 +33,6 @@ SECTIONS = (
     "model",
     "frontend",
     "warmup",
-    "generator",
-    "choose",
     "adapt",
     "corrections",
     "refine",
@@ -79,12 +77,14 @@ class Tiny:
             dict.fromkeys(SECTIONS, 1)
             | {"evaluate": 1, "judge": 1, "rivals": dict.fromkeys(methods_of(Kind.RIVAL), 1)},
         )
+        self.write(layout.round_settings(SCENE), {layout.round_key(1): dict.fromkeys(ROUND_SECTIONS, 1)})
+        self.write(layout.asked(SCENE, 1) / "facts.json", {})
         self.write(layout.selection(SCENE), {method.name: True for method in METHODS if not method.always_made})
         self.write(layout.CODE, hashes(TREE, HERE))
-        for kind in ("generator", "choice", "judge", "model", *methods_of(Kind.RIVAL)):
+        for kind in ("judge", "model", *methods_of(Kind.RIVAL)):
             link_files({}, folder / layout.given(SCENE, kind))
-        link_files({"round_1": folder / "away/picture.png"}, folder / layout.given(SCENE, "generator"))
-        link_files({"round_1": folder / "away/chosen.png"}, folder / layout.given(SCENE, "choice"))
+        link_files({"file": folder / "away/picture.png"}, folder / layout.given(SCENE, "generator") / "round_1")
+        link_files({"file": folder / "away/chosen.png"}, folder / layout.given(SCENE, "choice") / "round_1")
         link_files({"weights": folder / "away/weights.safetensors"}, folder / layout.given(SCENE, "model"))
 
     def write(self, path: Path, content: dict[str, Any]) -> None:
@@ -137,7 +137,7 @@ FIRST_HAND_MODEL = {"resolve", "reconstruct", "precompute_anchors", "reconstruct
         ("away/weights.safetensors", FIRST_HAND_MODEL),
         ("requirements.lock", {"code"}),
         ("requirements-nodeps.lock", {"code"}),
-        (f"scenes/{SCENE}/photo.png", {"prepare", "generate_view", "choose_view", "evaluate"}),
+        (f"scenes/{SCENE}/photo.png", {"prepare"}),
     ],
 )
 def test_other_bytes_of_the_same_name_and_size_rerun_what_reads_them(tiny: Tiny, file: str, stages: set[str]) -> None:
@@ -221,20 +221,20 @@ def test_a_configuration_names_its_files(tmp_path: Path, monkeypatch: pytest.Mon
     for name in ("p_1.png", "p_2.png", "w.safetensors"):
         Path(name).touch()
     values = {
-        "generator": {"backend": "file", "file": "p_{round}.png"},
-        "choose": {"candidate": "auto", "fit": "crop"},
-        "judge": {"backend": "none"},
         "model": {"weights": "w.safetensors"},
+        "judge": {"backend": "none"},
         "rivals": {"omnivggt": {"weights": None}, "ttt3r": {"weights": "org/name@main"}},
     }
-    found = named_files(values, 3)
-    assert found["generator"] == {"round_1": tmp_path / "p_1.png", "round_2": tmp_path / "p_2.png"}
+    auto = {"candidate": "auto", "fit": "crop"}
+    stored = {"generator": {"backend": "file", "file": "p_{round}.png"}, "choose": auto}
+    own = {"generator": {"backend": "replay"}, "choose": {"candidate": "p_{round}.png", "fit": "crop"}}
+    found = named_files(values, [stored, own, stored])
+    assert found["generator/round_1"] == {"file": tmp_path / "p_1.png"}
+    assert found["choice/round_2"] == {"file": tmp_path / "p_2.png"}
+    assert found["generator/round_2"] == found["generator/round_3"] == found["choice/round_1"] == {}
     assert found["model"] == {"weights": tmp_path / "w.safetensors"}
     assert found["omnivggt"] == found["ttt3r"] == {}
-    assert named_files(values | {"generator": {"backend": "replay"}}, 1)["generator"] == {}
-    own = named_files(values | {"choose": {"candidate": "p_{round}.png", "fit": "crop"}}, 3)["choice"]
-    assert own == found["generator"]
-    link_files(found["generator"], Path("given"))
+    link_files(found["generator/round_1"], Path("given"))
     link_files(found["model"], Path("given"))
     assert [path.name for path in Path("given").iterdir()] == ["weights"]
 

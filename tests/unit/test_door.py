@@ -12,7 +12,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.expand import parse_arguments, stage_scene
 from sceneexpander.ingest import load_scene
 from sceneexpander.ingest.config import IngestConfig
-from sceneexpander.preflight import check_scene
+from sceneexpander.pipeline.preflight import check_scene
 from tests.unit.ingest.test_survey import photos, texture
 
 pytestmark = pytest.mark.timeout(60)

@@ -23,14 +23,14 @@ import yaml
 from PIL import Image
 
 from sceneexpander import expand as command
-from sceneexpander import preflight
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
 from sceneexpander.artifacts.page import BaseModel, ScenePage
 from sceneexpander.errors import UserError, printable
 from sceneexpander.expand import Request, expand, run_name, stage_scene
 from sceneexpander.generation import Forecast
+from sceneexpander.pipeline import preflight
 from sceneexpander.pipeline.locks import run_lock
-from sceneexpander.preflight import CheckedScene
+from sceneexpander.pipeline.preflight import CheckedScene
 from sceneexpander.selection import read_selection
 from tests.unit.ingest.test_survey import texture
 

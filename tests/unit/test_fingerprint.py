@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander.fingerprint import FingerprintError, SourceTree
+from sceneexpander.pipeline.fingerprint import FingerprintError, SourceTree
 
 FILES = {
     "pkg/__init__.py": "",

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from sceneexpander import preflight
 from sceneexpander.errors import UserError
 from sceneexpander.expansion import ModelConfig
-from sceneexpander.preflight import Checked, check_device, check_scene, check_weights
+from sceneexpander.pipeline import preflight
+from sceneexpander.pipeline.preflight import Checked, check_device, check_scene, check_weights
 
 ROOT = Path(__file__).parents[2]
 

@@ -43,6 +43,16 @@ def test_a_selection_comes_back_as_it_was_written(tmp_path: Path, rounds: str, p
     assert read_selection(tmp_path / "again") == selection
 
 
+def test_a_round_may_say_itself_how_its_picture_is_obtained(tmp_path: Path) -> None:
+    text = "[{k: 1, prev: 0}, {k: 2, prev: 1, overrides: [generator=reproject, choose.candidate=2]}]"
+    selection = read_selection(written(tmp_path, rounds=text))
+    assert selection.overrides_of(1) == ()
+    assert selection.overrides_of(2) == ("generator=reproject", "choose.candidate=2")
+    (tmp_path / "again").mkdir()
+    (tmp_path / "again" / "params.yaml").write_text(selection.to_yaml())
+    assert read_selection(tmp_path / "again") == selection
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -57,6 +67,9 @@ def test_a_selection_comes_back_as_it_was_written(tmp_path: Path, rounds: str, p
                 "[{k: 1}]",
                 "[{prev: 0}]",
                 "[{k: 1, prev: 0, x: 1}]",
+                "[{k: 1, prev: 0, overrides: 1}]",
+                "[{k: 1, prev: 0, overrides: [1]}]",
+                "[{k: 1, prev: 0, overrides: [adapt.steps=5]}]",
                 "[{k: 2, prev: 1}]",
                 "[{k: 1, prev: 1}]",
                 "[{k: 1, prev: -1}]",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander.fingerprint import SourceTree
+from sceneexpander.pipeline.fingerprint import SourceTree
 
 ROOT = Path(__file__).parents[2]
 LIGHT = ("fingerprint", "rival", "optimise", "gaussian_splatting", "render", "pack", "evaluate", "track")

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneexpander.errors import UserError
+from sceneexpander.pipeline.surroundings import local_config, pipeline_environment, settle_project
+from sceneexpander.pipeline.workspace import make_workspace, workspace_environment
 from sceneexpander.selection import Selection
-from sceneexpander.surroundings import local_config, pipeline_environment, settle_project
-from sceneexpander.workspace import make_workspace, workspace_environment
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = [

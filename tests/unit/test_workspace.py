@@ -7,8 +7,8 @@ import yaml
 
 from sceneexpander.errors import UserError
 from sceneexpander.expand import parse_arguments, stage_scene
+from sceneexpander.pipeline.workspace import make_workspace, merged_overrides
 from sceneexpander.selection import Selection, read_selection
-from sceneexpander.workspace import make_workspace, merged_overrides
 
 ROOT = Path(__file__).parents[2]
 

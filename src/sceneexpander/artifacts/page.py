@@ -13,6 +13,7 @@ from typing import Any
 
 from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.artifacts.cameras import CameraReport
+from sceneexpander.artifacts.proposals import Proposals
 from sceneexpander.artifacts.store import ArtifactError, check_inside, read_json, read_typed, write_json_atomic
 
 SCHEMA = "page/1"
@@ -228,6 +229,7 @@ class RoundPage:
         cameras: of all views, estimated together; None for models that need none.
         problems: a text of everything that is not as it should be with the cameras.
         judgement: of the inserted view; None if it was not judged.
+        proposals: for the next motion, of the last round; None for others.
         statistics: of its stages, by stage and method.
         warnings: sentences for people.
     """
@@ -256,6 +258,7 @@ class RoundPage:
     cameras: CameraReport | None
     problems: str | None
     judgement: Judgement | None
+    proposals: Proposals | None
     statistics: Mapping[str, StageRun]
     warnings: tuple[str, ...]
 
@@ -306,6 +309,9 @@ class ScenePage:
         for item in self.rounds:
             yield from (item.inserted, item.viewer)
             yield from (place for place in (item.sheet, item.overlay, item.problems) if place is not None)
+            if item.proposals is not None:
+                yield from () if item.proposals.map is None else (item.proposals.map,)
+                yield from (proposal.preview for proposal in item.proposals.proposals)
             yield from (missing.metrics for missing in item.unavailable)
             yield from (place for look in (item.looks.looks if item.looks else ()) for place in look.pictures.values())
             for method in item.methods:

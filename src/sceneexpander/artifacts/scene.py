@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -20,7 +20,8 @@ from sceneexpander.artifacts.store import (
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.geometry.similarity import Similarity, align_poses
 
-SCHEMA = "scene/1"
+SCHEMA = "scene/2"
+ROUND_SCHEMA = "asked-round/1"
 KNOWN_SCHEMA = "known-cameras/1"
 
 
@@ -36,6 +37,16 @@ class RoundSpec:
     new_object: str = ""
     inserted: str | None = None
     inserted_sha256: str | None = None
+
+    def save(self, folder: Path) -> None:
+        """Write into a (scratch) folder."""
+        save_artifact(folder, ROUND_SCHEMA, {f.name: getattr(self, f.name) for f in fields(self)}, {})
+
+    @classmethod
+    def load(cls, folder: Path) -> RoundSpec:
+        """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
+        facts, _ = load_artifact(folder, ROUND_SCHEMA)
+        return read_typed(cls, facts, folder / FACTS_NAME)
 
 
 Matrix4 = tuple[tuple[float, float, float, float], ...]
@@ -116,11 +127,14 @@ class _KnownFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Made by ``prepare``; read by every later stage. ``notes`` say what was noticed about the user's files."""
+    """Made by ``prepare``; read by every later stage. ``notes`` say what was noticed about the user's files.
+
+    Saved without its ``rounds``: each of them is an artefact of its own, so that one more leaves everything else as it is.
+    """
 
     name: str
     views: ViewSet
-    rounds: tuple[RoundSpec, ...]
+    rounds: tuple[RoundSpec, ...] = ()
     known: KnownCameras | None = None
     notes: tuple[str, ...] = ()
 
@@ -135,27 +149,25 @@ class Scene:
         return self.rounds[number - 1]
 
     def save(self, folder: Path) -> None:
-        """Write into a (scratch) folder."""
+        """Write all but the rounds into a (scratch) folder."""
         self.views.save(folder / "views")
         tensors: dict[str, Tensor] = {}
         if self.known is not None:
             tensors = {f"known.{name}": value for name, value in self.known.tensors().items()}
         known = KnownCameras() if self.known is None else self.known
-        facts = {"name": self.name, "rounds": self.rounds, "notes": self.notes, **known.facts()}
+        facts = {"name": self.name, "notes": self.notes, **known.facts()}
         save_artifact(folder, SCHEMA, facts, tensors)
 
     @classmethod
     def load(cls, folder: Path) -> Scene:
-        """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
+        """Read what `save` wrote: a scene without rounds. Raises `ArtifactError` if it is missing or damaged."""
         facts, tensors = load_artifact(folder, SCHEMA)
         read = read_typed(_Facts, facts, folder / FACTS_NAME)
         known = None
         if tensors:
             given = {"metric": read.metric, "capture_from_world": read.capture_from_world}
             known = KnownCameras(**load_fields(KnownCameras, given, tensors, folder, prefix="known."))
-        return cls(
-            name=read.name, views=ViewSet.load(folder / "views"), rounds=read.rounds, known=known, notes=read.notes
-        )
+        return cls(name=read.name, views=ViewSet.load(folder / "views"), known=known, notes=read.notes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,7 +175,6 @@ class _Facts:
     """What is not a tensor or an artefact of its own."""
 
     name: str
-    rounds: tuple[RoundSpec, ...]
     metric: bool
     notes: tuple[str, ...]
     capture_from_world: Matrix4 | None = None

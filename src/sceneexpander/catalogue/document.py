@@ -30,7 +30,9 @@ def _line(metric: Metric) -> tuple[str, ...]:
 
 
 def _scope(scope: Scope) -> str:
-    words = [f"{scope.views} views" if scope.views in ("captured", "inserted", "held_out") else str(scope.views)]
+    words = [
+        f"{scope.views} views" if scope.views in ("captured", "inserted", "earlier", "held_out") else str(scope.views)
+    ]
     words += [f"{scope.size} size"] if scope.size != "stored" else []
     words += [f"{scope.region} pixels"] if scope.region != "all" else []
     return ", ".join(words).replace("held_out", "held-out").replace("none", "the whole")

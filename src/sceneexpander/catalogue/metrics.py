@@ -52,6 +52,7 @@ class Views(StrEnum):
 
     CAPTURED = "captured"  # the mean over those that have a camera
     INSERTED = "inserted"  # the one of the row's round
+    EARLIER = "earlier"  # captured and inserted ones that are older than the row's round
     HELD_OUT = "held_out"  # at true cameras that no method was given
     TOUR = "tour"  # the frames of the camera path
     NONE = "none"  # the reconstruction or the run as a whole
@@ -199,6 +200,7 @@ def _at_size(
 
 _CAPTURED = Scope(views=Views.CAPTURED)
 _INSERTED = Scope(views=Views.INSERTED)
+_EARLIER = Scope(views=Views.EARLIER)
 _HELD_OUT = Scope(views=Views.HELD_OUT, region=Region.NEW)
 _WHOLE = Scope(views=Views.NONE)
 _TOUR = Scope(views=Views.TOUR)
@@ -284,6 +286,24 @@ QUALITY = (
         scope=Scope(views=Views.CAPTURED, region=Region.OTHERS),
         unit="%",
         digits=1,
+    ),
+    Metric(
+        name="psnr_earlier_inserted_db",
+        group=Group.QUALITY,
+        title="Earlier insertions' PSNR",
+        scope=_EARLIER,
+        unit="dB",
+        better="higher",
+        meaning="Views inserted in earlier rounds, at their own cameras and the stored size, against their pictures; mean over views.",
+        shown=Shown.PAGE,
+    ),
+    Metric(
+        name="psnr_worst_earlier_db",
+        group=Group.QUALITY,
+        title="PSNR of the worst earlier view",
+        scope=_EARLIER,
+        unit="dB",
+        better="higher",
     ),
     Metric(
         name="tour_covered",

@@ -49,12 +49,14 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
     write_bytes_atomic(path, text.encode())
 
 
-def read_sections(path: Path, sections: type[T]) -> T:
-    """The top-level keys of a composed configuration that ``sections`` (a dataclass) names, and no others.
+def read_sections(path: Path, sections: type[T], *, within: str | None = None) -> T:
+    """The keys of a composed configuration that ``sections`` (a dataclass) names, and no others: top-level ones, or those ``within`` a key.
 
     A stage therefore cannot depend on a setting that its entry in ``dvc.yaml`` does not list.
     """
     raw = read_yaml(path)
+    if within is not None:
+        raw = raw.get(within) if isinstance(raw, Mapping) else None
     if not isinstance(raw, Mapping):
         raise ConfigError("holds no sections", where=path, fix="rerun the resolve stage")
     wanted = {f.name for f in dataclasses.fields(sections)}  # type: ignore[arg-type]

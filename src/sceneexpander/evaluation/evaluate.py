@@ -9,13 +9,15 @@ from importlib.metadata import PackageNotFoundError, version
 
 from sceneexpander.artifacts.metrics import Fit, MetricsRow, ViewMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.catalogue import register
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.earlier import EarlierRegions
 from sceneexpander.evaluation.measure import Measure, Navigation, Subject, Values, known_values
 from sceneexpander.evaluation.sizes import AtOtherSizes
-from sceneexpander.evaluation.truth import SceneTruth, TruthMetrics, against_truth
+from sceneexpander.evaluation.truth import TruthMetrics, against_truth
 from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverage, measure_views
 
 
@@ -43,7 +45,15 @@ class AgainstTruth(Measure):
         return {metric.name: getattr(found, metric.name) for metric in self.metrics}
 
 
-MEASURES: list[Measure] = [AtStoredSize(), FromOthers(), AtOtherSizes(), TourCoverage(), AgainstTruth(), Counts()]
+MEASURES: list[Measure] = [
+    AtStoredSize(),
+    FromOthers(),
+    AtOtherSizes(),
+    TourCoverage(),
+    EarlierRegions(),
+    AgainstTruth(),
+    Counts(),
+]
 
 
 def register_measure(measure: Measure) -> None:

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.catalogue import Metric
 from sceneexpander.evaluation.config import EvaluateConfig
-from sceneexpander.evaluation.truth import SceneTruth
 from sceneexpander.splatting import Render
 
 Values = Mapping[str, float | None]  # by names of the catalogue; None: not defined here

@@ -107,7 +107,7 @@ def measure_views(
             continue
         if view_id not in picture_of:
             raise ValueError(f"no picture of view {view_id!r} was given, only {list(picture_of)}")
-        seen = _seen(reconstruction, index, views, picture_of[view_id], config)
+        seen = see_view(reconstruction, index, views, picture_of[view_id], config)
         values: dict[str, float] = {}
         for measure in measures:
             values |= known_values(measure, measure.of_view(seen))
@@ -126,7 +126,10 @@ def measure_views(
     return tuple(rows)
 
 
-def _seen(reconstruction: Reconstruction, index: int, views: ViewSet, place: int, config: EvaluateConfig) -> SeenView:
+def see_view(
+    reconstruction: Reconstruction, index: int, views: ViewSet, place: int, config: EvaluateConfig
+) -> SeenView:
+    """A view of a reconstruction drawn at its own camera, beside its picture, which is the one at ``place`` in ``views``."""
     picture = views.images[place]
     valid = None if views.valid is None else views.valid[place]
     if valid is not None and int(valid.sum()) < _FEWEST_PIXELS:

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.evaluation.image import psnr
-from sceneexpander.evaluation.truth import SceneTruth
 from sceneexpander.expandbench.prepared import placement_in
 from sceneexpander.expandbench.scenes import BenchScene, TrueView
 from sceneexpander.splatting import render

@@ -15,7 +15,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
 from sceneexpander.artifacts.state import ExpansionState, load_priors, save_priors
 from sceneexpander.artifacts.store import directory_being_written
-from sceneexpander.evaluation.truth import SceneTruth
+from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.expandbench.grades import Grade
 from sceneexpander.expandbench.scenes import BenchScene
 from sceneexpander.expansion import LoadedModel, RoundInputs, captured_prediction, initial_state

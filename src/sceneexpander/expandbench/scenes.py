@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sceneexpander.artifacts.truth import SceneTruth, ViewTruth
 from sceneexpander.artifacts.views import ViewRecord, ViewSet, to_uint8
-from sceneexpander.evaluation.truth import SceneTruth, ViewTruth
 from sceneexpander.synthetic.bundled import unseen_by
 from sceneexpander.synthetic.degrade import auto_exposure, encode_radiance
 from sceneexpander.synthetic.misalign import MisalignedView, Misalignment, misalign

@@ -25,6 +25,7 @@ class GenerationContext:
         spec: the user's words.
         captured: the photos, as prepared.
         cache: folder of answers that were paid for, by content; shared by all runs of a project, and no stage's output.
+        recorded: folder that the path of a recorded picture is relative to; None: the user's.
     """
 
     scene_folder: Path
@@ -33,6 +34,7 @@ class GenerationContext:
     spec: RoundSpec
     captured: ViewSet
     cache: Path
+    recorded: Path | None = None
 
     @property
     def where(self) -> str:

@@ -38,20 +38,25 @@ def start_view(so_far: SceneSoFar, name: str) -> int:
 
 def moved_camera(so_far: SceneSoFar, steps: tuple[Step, ...], view: int, *, where: str) -> Float[Tensor, "4 4"]:
     """``world_from_cam`` after a motion that starts at a view, in the frame of the reconstruction."""
+    return move_camera(
+        so_far.reconstruction.world_from_cam[view],
+        steps,
+        up=upwards(so_far, view),
+        distance=gaze_distance(so_far, view),
+        units_per_metre=units_per_metre(so_far),
+        where=where,
+    )
+
+
+def upwards(so_far: SceneSoFar, view: int) -> Float[Tensor, "3"]:
+    """The unit vector that is up in the world: what the photos have in common, or a view's own where they are held in all ways."""
     scene = so_far.reconstruction
     usable = scene.posed & ~scene.generated
     downs = scene.world_from_cam[usable][:, :3, 1]
     up = -torch.nn.functional.normalize(downs.mean(0), dim=0)
     if not bool(torch.isfinite(up).all()) or float(downs.mean(0).norm()) < 1e-3:
-        up = -scene.world_from_cam[view, :3, 1]  # photos held in all ways: only this camera's own is left
-    return move_camera(
-        scene.world_from_cam[view],
-        steps,
-        up=up,
-        distance=gaze_distance(so_far, view),
-        units_per_metre=units_per_metre(so_far),
-        where=where,
-    )
+        return -scene.world_from_cam[view, :3, 1]
+    return up
 
 
 def gaze_distance(so_far: SceneSoFar, view: int) -> float:

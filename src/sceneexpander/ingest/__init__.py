@@ -3,7 +3,7 @@
 from sceneexpander.ingest.config import Fit, IngestConfig
 from sceneexpander.ingest.decode import Picture, decode_picture, read_picture
 from sceneexpander.ingest.fit import FittedPicture, FrameSize, common_frame, fit_picture
-from sceneexpander.ingest.listing import safe_name, scene_files
+from sceneexpander.ingest.listing import recorded_files, safe_name, scene_files
 from sceneexpander.ingest.load import LoadedViews, load_photos, load_scene, read_views
 from sceneexpander.ingest.scene_file import make_round
 from sceneexpander.ingest.survey import Survey, list_pictures, survey_pictures
@@ -25,6 +25,7 @@ __all__ = [
     "make_round",
     "read_picture",
     "read_views",
+    "recorded_files",
     "safe_name",
     "scene_files",
     "survey_pictures",

@@ -7,6 +7,7 @@ import re
 import unicodedata
 from pathlib import Path
 
+from sceneexpander.artifacts.scene import RoundSpec
 from sceneexpander.errors import UserError
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.links import require_inside
@@ -38,9 +39,7 @@ def scene_files(folder: Path) -> list[Path]:
         logger.warning("%s", note)
     files = [folder / SCENE_FILE, *capture.all_files]
     for spec in facts.rounds:
-        if spec.inserted is not None:
-            target = folder / spec.inserted
-            files += list_pictures(target, inside=folder) if target.is_dir() else [target]
+        files += recorded_files(spec, folder)
     truth = folder / TRUTH_FOLDER
     if truth.is_dir():
         files += _truth_files(require_inside(truth, folder), folder)
@@ -48,6 +47,14 @@ def scene_files(folder: Path) -> list[Path]:
         require_plain_file(require_inside(path, folder))
         require_text_name(path)
     return list(dict.fromkeys(files))
+
+
+def recorded_files(spec: RoundSpec, folder: Path) -> list[Path]:
+    """The pictures that a round of the scene folder names: one, the candidates of a folder, or none. Paths start with ``folder``."""
+    if spec.inserted is None:
+        return []
+    target = folder / spec.inserted
+    return list_pictures(target, inside=folder) if target.is_dir() else [target]
 
 
 def read_scene_capture(folder: Path, facts: SceneFile, config: IngestConfig) -> Capture:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from sceneexpander.artifacts.cameras import CameraReport
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.judgement import FILE_NAME as JUDGEMENT
-from sceneexpander.artifacts.metrics import MetricsRow
+from sceneexpander.artifacts.metrics import MetricsRow, load_row
 from sceneexpander.artifacts.page import (
     BaseModel,
     Judgement,
@@ -31,14 +31,17 @@ from sceneexpander.artifacts.page import (
     Steps,
     Still,
 )
+from sceneexpander.artifacts.proposals import Proposals
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
-from sceneexpander.artifacts.scene import Scene
+from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.source_type import source_type_xmp
 from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed, write_bytes_atomic
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.catalogue import LOOKS, MAIN, STEPS
+from sceneexpander.catalogue.methods import CAPTURED
+from sceneexpander.evaluation.quality import find_failures
 from sceneexpander.report.camera_map import camera_map
 from sceneexpander.report.cameras import gathered_cameras
 from sceneexpander.report.course import verdict
@@ -73,18 +76,20 @@ class MethodSource:
 class RoundSource:
     """Artefacts of one round.
 
-    ``log`` is the adaptation's, with its looks (``looks.json``, ``looks/``) and the verdict on the inserted view
-    (``acceptance.json``) beside it, where there are any; ``statistics`` holds one file per stage run. ``cameras`` is the `CameraReport`
-    of all views, the inserted one included; its folder does not exist where the model needs no cameras. ``judged`` is the
+    ``asked`` is its `RoundSpec`. ``log`` is the adaptation's, with its looks (``looks.json``, ``looks/``) and the verdict on the inserted
+    view (``acceptance.json``) beside it, where there are any; ``statistics`` holds one file per stage run. ``cameras`` is the
+    `CameraReport` of all views, the inserted one included; its folder does not exist where the model needs no cameras. ``judged`` is the
     `JudgedRound`.
     """
 
     number: int
+    asked: Path
     inserted: Path
     methods: Sequence[MethodSource]
     log: Path
     statistics: Path
     cameras: Path | None = None
+    proposals: Path | None = None
     judged: Path | None = None
 
 
@@ -119,7 +124,7 @@ def collect_scene(source: SceneSource, folder: Path) -> None:
         captured=_captured(scene.views, folder),
         cameras=gathered_cameras(source.cameras),
         statistics=_statistics(source.statistics),
-        rounds=tuple(_round(item, source, scene, folder) for item in source.rounds),
+        rounds=tuple(_round(item, source, folder) for item in source.rounds),
     )
     _write_viewers(source, scene, folder)
     page.save(folder)
@@ -142,7 +147,7 @@ def _write_viewers(source: SceneSource, scene: Scene, folder: Path) -> None:
         known = {view for method in shown for view in method.splats.cameras.view_ids}
         page = viewer_page(
             scene.name,
-            scene.round_spec(item.number).prompt,
+            RoundSpec.load(item.asked).prompt,
             shown,
             {view: picture for view, picture in pictures.items() if view in known},
         )
@@ -170,7 +175,7 @@ def _captured(views: ViewSet, folder: Path) -> tuple[Photo, ...]:
     return tuple(photos)
 
 
-def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder: Path) -> RoundPage:
+def _round(source: RoundSource, scene_source: SceneSource, folder: Path) -> RoundPage:
     inserted = InsertedView.load(source.inserted)
     chosen = inserted.provenance[inserted.chosen]
     base = f"round_{source.number}"
@@ -181,7 +186,7 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
     if sheet.is_file():
         shutil.copyfile(sheet, folder / base / "sheet.png")
     overlay = source.inserted / "overlay.png"
-    spec = scene.round_spec(source.number)
+    spec = RoundSpec.load(source.asked)
     cameras = gathered_cameras(source.cameras)
     looks = _looks(source.log.parent, folder, base)
     judgement = _read_if_any(Judgement, source.log.parent / "acceptance.json")
@@ -223,11 +228,38 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
         cameras=cameras,
         problems=_problems(source, scene_source, folder, base),
         judgement=judgement,
+        proposals=_proposals(source.proposals, folder, base),
         statistics=_statistics(source.statistics),
         warnings=(
             *_warnings(methods, chosen.parameters, cameras),
             *([judged.text] if (judged := verdict(judgement)) is not None and judged.refused else []),
             *(looks.warnings if looks else ()),
+            *_failures(source, inserted.view.view_ids[0]),
+        ),
+    )
+
+
+def _failures(source: RoundSource, inserted_id: str) -> list[str]:
+    """Why no round should follow this one, a sentence each."""
+    rows = {item.name: load_row(item.metrics) for item in source.methods if item.name in (MAIN, CAPTURED)}
+    known = {name: row for name, row in rows.items() if isinstance(row, MetricsRow)}
+    if MAIN not in known:
+        return []
+    failures = find_failures(known[MAIN], known.get(CAPTURED), inserted_id)
+    return [f"The round failed quality control: {reason}." for reason in failures]
+
+
+def _proposals(source: Path | None, folder: Path, base: str) -> Proposals | None:
+    """Proposals with their pictures in the folder; None if there are none."""
+    if source is None or not source.is_dir():
+        return None
+    found = Proposals.load(source)
+    return replace(
+        found,
+        map=None if found.map is None else _copy(source / found.map, folder, f"{base}/proposals/{found.map}"),
+        proposals=tuple(
+            replace(item, preview=_copy(source / item.preview, folder, f"{base}/proposals/{item.preview}"))
+            for item in found.proposals
         ),
     )
 

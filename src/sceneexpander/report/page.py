@@ -17,6 +17,7 @@ from sceneexpander.report.cameras import cameras_shown
 from sceneexpander.report.course import FITTED, fits, looks_shown, verdict
 from sceneexpander.report.curve import curve_chart, objective_curves, smoothing_window
 from sceneexpander.report.judged import load_judged, page_table
+from sceneexpander.report.rounds import RoundsShown, rounds_shown
 from sceneexpander.report.words import LAYERS, PICTURE_KINDS, method_label, number_tables
 
 _Filled = dict[str, Any]  # what a part of the template is filled with
@@ -56,10 +57,25 @@ def _scene(page: ScenePage, folder: Path) -> _Filled:
         "captured": page.captured,
         "cameras": cameras_shown(page.cameras, _pictures(page)),
         "rounds": [_round(item, page, folder) for item in page.rounds],
+        "course": _course(page, folder),
+        "proposals": page.rounds[-1].proposals if page.rounds else None,
         "facts": _facts(page),
         "timings": _timings(page),
         "settings": sorted(page.settings.items()),
     }
+
+
+def _course(page: ScenePage, folder: Path) -> RoundsShown | None:
+    """What became of all regions over the rounds; None without more than one of them."""
+
+    def row_of(item: RoundPage, name: str) -> MetricsRow | None:
+        found = next((method for method in item.methods if method.name == name), None)
+        return None if found is None else MetricsRow.load(folder / found.metrics)
+
+    if not page.rounds:
+        return None
+    rows = [row_of(item, MAIN) for item in page.rounds]
+    return rounds_shown(page.rounds, rows, row_of(page.rounds[0], CAPTURED), _names(page))
 
 
 def _round(page: RoundPage, scene: ScenePage, folder: Path) -> _Filled:

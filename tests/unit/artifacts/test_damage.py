@@ -43,6 +43,7 @@ from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
 from sceneexpander.artifacts.state import WeightsChange, load_priors, save_priors
 from sceneexpander.artifacts.store import FACTS_NAME, TENSORS_NAME, ArtifactError, read_json
+from sceneexpander.artifacts.truth import SceneTruth, ViewTruth
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.artifacts.views import LensFacts, ViewSet
 from sceneexpander.geometry.priors import Priors
@@ -94,6 +95,11 @@ def scene() -> Scene:
     )
 
 
+def truth() -> SceneTruth:
+    camera = {"world_from_cam": torch.eye(4), "intrinsics_px": torch.eye(3)}
+    return SceneTruth(views={"1" * 64: ViewTruth(**camera, depth=torch.ones(2, 3)), "2" * 64: ViewTruth(**camera)})
+
+
 def metrics() -> MetricsRow:
     view = ViewMetrics(view_id="v", generated=False, posed=True, values={"psnr_captured_db": 20.0})
     return MetricsRow(
@@ -117,6 +123,7 @@ def save_page(folder: Path) -> None:
         unavailable=(MissingMethod(name="ttt3r", model="ttt3r", reason="r", metrics="n.json"),),
         steps=Steps(inserted=(True, False), values={"loss": (1.0, 2.0)}),
         looks=LooksPage(identity="abc", looks=(look,), warnings=()), cameras=camera_report(), problems="cameras.txt",
+        proposals=None,
         judgement=Judgement(overlap=0.5, depth_conflict=None, colour_conflict=0.1, cameras_moved_deg=0.0, reasons=()),
         statistics={"adapt": StageRun(started=1.0, wall_s=2.0, peak_rss_mb=3.0)}, warnings=("w",),
     )  # fmt: skip
@@ -140,9 +147,12 @@ def read_row(folder: Path) -> object:
 
 
 UNAVAILABLE = UnavailableRow(scene="room", round=1, method="ttt3r", model="ttt3r", seed=0, reason="needs views")
+ASKED = RoundSpec(prompt="a bench", inserted="i/a.png", inserted_sha256="1" * 64)
 PRIORS = Priors(depth=torch.ones(2, 4, 4), posed=torch.tensor([True, False]))
 KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "scene": (lambda folder: scene().save(folder), Scene.load),
+    "asked": (lambda folder: ASKED.save(folder), RoundSpec.load),
+    "truth": (lambda folder: truth().save(folder), SceneTruth.load),
     "views": (lambda folder: lens_views().save(folder), ViewSet.load),
     "inserted": (lambda folder: inserted().save(folder), InsertedView.load),
     "anchors": (lambda folder: anchors().save(folder), Anchors.load),

@@ -15,13 +15,14 @@ from sceneexpander.catalogue import METHODS, Kind, Method
 from sceneexpander.catalogue.methods import CORRECTED, methods_of
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.inference.config import RivalsConfig
-from sceneexpander.packages import LOCKS
+from sceneexpander.pipeline.packages import LOCKS
 from stages import layout
 from stages.fingerprint import stage_names
 
 ROOT = Path(__file__).parents[3]
 PIPELINE: dict[str, Any] = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
 CONFIG = "outputs/${item.scene}/config.yaml"
+ROUND_SETTINGS = "outputs/${item.scene}/rounds.yaml"
 # resolve makes the configuration; the gathering stages get it through the artefacts of the scenes.
 WITHOUT_SECTIONS = {"code", "resolve", "collect", "report", "track"}
 
@@ -48,9 +49,13 @@ def test_a_stage_depends_on_its_own_code(stage: str) -> None:
 
 @pytest.mark.parametrize("stage", sorted(set(PIPELINE) - WITHOUT_SECTIONS))
 def test_parameters_are_the_sections_that_the_stage_reads(stage: str) -> None:
-    sections = importlib.import_module(f"stages.{stage}").Sections
+    module = importlib.import_module(f"stages.{stage}")
     # A key below a section: the part of it that belongs to the stage's method.
-    assert [key.partition(".")[0] for key in tracked(stage, CONFIG)] == [f.name for f in fields(sections)]
+    assert [key.partition(".")[0] for key in tracked(stage, CONFIG)] == [f.name for f in fields(module.Sections)]
+    of_round = fields(module.RoundSections) if hasattr(module, "RoundSections") else ()
+    assert [filled(key) for key in tracked(stage, ROUND_SETTINGS)] == [
+        f"{layout.round_key(2)}.{f.name}" for f in of_round
+    ]
 
 
 def filled(path: str) -> str:
@@ -67,6 +72,7 @@ def filled(path: str) -> str:
             "resolve",
             [
                 layout.config("S"),
+                layout.round_settings("S"),
                 layout.selection("S"),
                 *(
                     layout.given("S", kind)
@@ -74,7 +80,15 @@ def filled(path: str) -> str:
                 ),
             ],
         ),
-        ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
+        (
+            "prepare",
+            [
+                layout.prepared("S"),
+                layout.asked("S", 1).parent,
+                layout.truth("S"),
+                layout.statistics("prepare", "S"),
+            ],
+        ),
         ("reconstruct", [layout.state("S", 0), layout.match_memory("S"), layout.statistics("reconstruct", "S")]),
         ("generate_view", [layout.candidates("S", 2), layout.statistics("generate_view", "S", 2)]),
         ("choose_view", [layout.inserted("S", 2), layout.statistics("choose_view", "S", 2)]),
@@ -94,6 +108,7 @@ def filled(path: str) -> str:
                 layout.statistics("reconstruct_inserted", "S", 2),
             ],
         ),
+        ("propose", [layout.proposals("S", 2), layout.statistics("propose", "S", 2)]),
         ("adapt", [layout.state("S", 2), layout.statistics("adapt", "S", 2)]),
         (
             "correct",

@@ -18,10 +18,12 @@ from PIL import Image
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError, sha256_of_file
+from sceneexpander.artifacts.truth import SceneTruth, ViewTruth
 from sceneexpander.artifacts.views import ViewSet
-from sceneexpander.evaluation.truth import SceneTruth, TruthMetrics, ViewTruth, against_truth, check_truth, load_truth
+from sceneexpander.evaluation.truth import TruthMetrics, against_truth
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
+from sceneexpander.ingest.truth import check_truth, load_truth
 from tests.unit.evaluation.made import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
 
 EYES = (0.0, 0.4, 0.9, 2.0)

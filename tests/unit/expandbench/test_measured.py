@@ -27,9 +27,9 @@ from sceneexpander.expansion import MethodConfig, compose_procedure
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.insertion.config import ENTRY_POINTS
 from sceneexpander.insertion.contradiction import pixel_trust
-from sceneexpander.packages import LOCKS
 from sceneexpander.photometric import fitting
 from sceneexpander.photometric.config import RefineConfig
+from sceneexpander.pipeline.packages import LOCKS
 from sceneexpander.splatting.kernel_backend import kernel_build
 from stages import adapt, correct, layout
 

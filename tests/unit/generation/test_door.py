@@ -22,7 +22,7 @@ from sceneexpander.generation import (
     SceneSoFar,
     make_generator,
 )
-from sceneexpander.preflight import check_scene
+from sceneexpander.pipeline.preflight import check_scene
 from tests.unit.ingest.test_survey import photos
 
 CONF = Path(__file__).parents[3] / "conf"
@@ -84,7 +84,7 @@ def test_looking_at_a_round_never_generates(
     (folder / "scene.yaml").write_text("rounds:\n  - {prompt: A bench.}\n  - {prompt: A cat.}\n")
     shown = compose(CONF, ["profile=smoke"])
     shown["generator"] = {"backend": "toy", "colour": "blue"}
-    monkeypatch.setattr("sceneexpander.preflight.compose", lambda *_: shown)
+    monkeypatch.setattr("sceneexpander.pipeline.preflight.compose", lambda *_: shown)
     checked = check_scene("s", folder, conf=CONF, overrides=[])
     assert checked.rounds == 2
     assert [forecast.requests for forecast in checked.forecasts] == [4, 4]

@@ -17,7 +17,7 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.files import write_yaml
 from sceneexpander.errors import UserError
 from sceneexpander.judge_run import judge_run, parse_arguments
-from sceneexpander.preflight import check_scene
+from sceneexpander.pipeline.preflight import check_scene
 from sceneexpander.project import JUDGED_FOLDER, ROOT_ENV
 from sceneexpander.splatting.video import write_video
 from stages import judge as judge_stage

@@ -104,7 +104,11 @@ def row(method: str, psnr: float) -> MetricsRow:
 def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
     folder = tmp_path_factory.mktemp("artefacts")
     views = view("v0").append(view("v1"))
-    Scene(name="room", views=views, rounds=(RoundSpec(prompt=NASTY),)).save(folder / "scene")
+    Scene(
+        name="room",
+        views=views,
+    ).save(folder / "scene")
+    RoundSpec(prompt=NASTY).save(folder / "asked")
     provenance = Provenance(
         backend="replay",
         prompt=f"Add: {NASTY}",
@@ -154,6 +158,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
         rounds=[
             RoundSource(
                 number=1,
+                asked=folder / "asked",
                 inserted=folder / "inserted",
                 methods=[
                     MethodSource(

@@ -40,9 +40,10 @@ class ReplayGenerator:
                 where=context.where,
                 fix="add 'inserted: FILE' to the round in scene.yaml, or have one made, e.g. with generator=reproject",
             )
-        target = require_inside(context.scene_folder / context.spec.inserted, context.scene_folder, where=context.where)
-        paths = list_pictures(target, inside=context.scene_folder) if target.is_dir() else [target]
-        candidates = [stored_candidate(path, context, "replay", folder=context.scene_folder) for path in paths]
+        folder = context.scene_folder if context.recorded is None else context.recorded
+        target = require_inside(folder / context.spec.inserted, folder, where=context.where)
+        paths = list_pictures(target, inside=folder) if target.is_dir() else [target]
+        candidates = [stored_candidate(path, context, "replay", folder=folder) for path in paths]
         digests = [candidate.provenance.sha256 for candidate in candidates]
         digest = sha256_of_bytes("".join(digests).encode()) if target.is_dir() else digests[0]
         if context.spec.inserted_sha256 not in (None, digest):

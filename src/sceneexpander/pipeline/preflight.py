@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -12,10 +12,10 @@ from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.image import WINDOW
-from sceneexpander.evaluation.truth import check_truth
 from sceneexpander.generation import Forecast, GenerationContext, check_round
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
+from sceneexpander.ingest.truth import check_truth
 from sceneexpander.judge import make_judge
 from sceneexpander.models.weights import HUB_ID
 from sceneexpander.project import GENERATED_FOLDER, JUDGED_FOLDER, find_project
@@ -56,6 +56,7 @@ def check_scene(
     conf: Path,
     overrides: Sequence[str],
     rounds: int | None = None,
+    round_overrides: Sequence[Sequence[str]] = (),
     methods: Sequence[str] = (),
     device: bool = True,
     checked: Checked | None = None,
@@ -68,6 +69,7 @@ def check_scene(
         conf: the configuration folder.
         overrides: Hydra overrides.
         rounds: how many rounds are to run; None: all that the scene defines.
+        round_overrides: further ones of each round, as far as it has any.
         methods: that are to run; reconstructors of others among them that have no weights will say so in their rows.
         device: whether the device must be there; not on a machine that only hands jobs to others.
         checked: of the same command's earlier calls; weights are loaded and pictures decoded once.
@@ -75,16 +77,23 @@ def check_scene(
     Raises:
         UserError: one line about the first problem found.
     """
-    config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
+    common = [f"scene={scene_option(conf, name)}", *overrides]
+    config = parse_dataclass(ProjectConfig, compose(conf, common))
+    own = {
+        number: parse_dataclass(ProjectConfig, compose(conf, [*common, *more]))
+        for number, more in enumerate(round_overrides, start=1)
+        if more
+    }
     if device:
         check_device(config.device)
     judge = make_judge(config.judge, find_project() / JUDGED_FOLDER)
     if judge is not None:
         judge.require()
     checked = Checked() if checked is None else checked
-    pictures = folder, config.scene, repr(config.generator), config.choose, rounds
+    obtained = tuple((number, repr(item.generator), item.choose) for number, item in {0: config, **own}.items())
+    pictures = folder, config.scene, obtained, rounds
     if pictures not in checked.pictures:
-        checked.pictures[pictures] = _check_pictures(name, folder, config, rounds)
+        checked.pictures[pictures] = _check_pictures(name, folder, config, own, rounds)
     needed = [config.model]
     for rival in (f.name for f in fields(RivalsConfig) if f.name in methods):
         section = config.rivals.of(rival)
@@ -104,8 +113,10 @@ def check_scene(
     return checked.pictures[pictures]
 
 
-def _check_pictures(name: str, folder: Path, config: ProjectConfig, rounds: int | None) -> CheckedScene:
-    """Read the photos, the pictures to insert that are there already, and what is known of the truth."""
+def _check_pictures(
+    name: str, folder: Path, config: ProjectConfig, own: Mapping[int, ProjectConfig], rounds: int | None
+) -> CheckedScene:
+    """Read the photos, the pictures to insert that are there already, and what is known of the truth. ``own``: of rounds that have one."""
     scene = load_scene(folder, config.scene)
     if min(scene.views.height, scene.views.width) < WINDOW:
         size = f"{scene.views.width} x {scene.views.height}"
@@ -125,7 +136,8 @@ def _check_pictures(name: str, folder: Path, config: ProjectConfig, rounds: int 
             captured=scene.views,
             cache=find_project() / GENERATED_FOLDER,
         )
-        forecast, inserted = check_round(context, config.generator, config.choose)
+        of_round = own.get(number, config)
+        forecast, inserted = check_round(context, of_round.generator, of_round.choose)
         forecasts.append(forecast)
         if inserted is not None:
             records += inserted.view.records

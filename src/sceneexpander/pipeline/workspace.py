@@ -19,13 +19,13 @@ from pathlib import Path
 from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.config.overrides import key_of, written_out
 from sceneexpander.errors import UserError, interruptible, printable
-from sceneexpander.packages import LOCKS
 from sceneexpander.pipeline.disk import make_writable, remove_tree, require_room
 from sceneexpander.pipeline.locks import RunLock, file_lock
+from sceneexpander.pipeline.packages import LOCKS
+from sceneexpander.pipeline.surroundings import LOCAL_CONFIG, local_config, pipeline_environment
 from sceneexpander.processes import ended_by_signals, kept
 from sceneexpander.project import SWEEP_ENV, find_project
 from sceneexpander.selection import PARAMS, Selection
-from sceneexpander.surroundings import LOCAL_CONFIG, local_config, pipeline_environment
 from sceneexpander.tracking.store import ignored_note
 
 COPIED_FOLDERS = ("conf", "src", "stages")
@@ -134,7 +134,7 @@ def reproduce_shared(folder: Path, *, project: Path, sweep: str | None = None) -
     environment = workspace_environment(folder, project)
     if sweep is not None:
         environment[SWEEP_ENV] = sweep
-    _run(["-m", "sceneexpander.workspace", str(folder)], folder, environment, None)
+    _run(["-m", "sceneexpander.pipeline.workspace", str(folder)], folder, environment, None)
 
 
 def _run(arguments: Sequence[str], folder: Path, environment: Mapping[str, str], lock: RunLock | None) -> None:
@@ -177,7 +177,7 @@ def run_stages(folder: Path, locks: Path) -> None:
 
 
 def main() -> None:
-    """``python -m sceneexpander.workspace FOLDER``: what `reproduce_shared` starts."""
+    """``python -m sceneexpander.pipeline.workspace FOLDER``: what `reproduce_shared` starts."""
     interruptible()
     folder = Path(sys.argv[1]).resolve()
     os.chdir(folder)
