@@ -20,7 +20,7 @@ from sceneexpander.inference.artefact import as_reconstruction
 from sceneexpander.models.weights import load_weights
 from sceneexpander.optimisation.config import RatesConfig
 from sceneexpander.optimisation.splats import Splats
-from sceneexpander.preflight import check_scene
+from sceneexpander.pipeline.preflight import check_scene
 from sceneexpander.tracking.store import KEY_TAG, database_path, last_experiment
 from tests.support.tiny_model import TinyReconstructor
 from tests.unit.artifacts.test_artifacts import make_views
