@@ -206,6 +206,7 @@ def test_a_setting_reruns_only_what_reads_it(finished: Project) -> None:
         "correct@room-round0",
         "adapt@room-round0",
         "judge@room-round0",
+        "propose@room-round0",
         "optimise@room-round0-sceneexpander",
         "collect@room",
         "report",
@@ -347,7 +348,7 @@ def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_pa
         "pack-sceneexpander",
         "evaluate-sceneexpander",
     }
-    assert fresh == {"adapt", "correct-corrected", "judge"} | made_from_it
+    assert fresh == {"adapt", "correct-corrected", "judge", "propose"} | made_from_it
 
 
 def test_rivals_are_rows_like_any_other_and_say_so_when_they_cannot_be(finished: Project, tmp_path: Path) -> None:
