@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.candidates import CandidateSet
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.views import save_png
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.generation import ChoiceConfig, choose_view
 from sceneexpander.judge import JudgeConfig, make_judge
 from sceneexpander.project import JUDGED_FOLDER

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sceneexpander.artifacts.judgement import JudgedRound
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.judge.config import ChatJudgeConfig, JudgeConfig
 from sceneexpander.project import JUDGED_FOLDER
 from sceneexpander.selection import read_selection

@@ -16,7 +16,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
@@ -31,6 +31,7 @@ from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, 
 from sceneexpander.expandbench.scenes import DEVELOPMENT, SCENES, TEST
 from sceneexpander.expandbench.studies import BEYOND, CONTROLS, STUDIES, TABLE, Study
 from sceneexpander.expansion import MethodConfig
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.fingerprint import SourceTree
 from sceneexpander.project import find_project
 

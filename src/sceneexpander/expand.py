@@ -24,12 +24,12 @@ from typing import Any
 import yaml
 
 from sceneexpander.artifacts.inserted import InsertedView
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point, printable
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.generation import Forecast, backend_of
 from sceneexpander.ingest import IngestConfig, make_round, read_picture, safe_name, scene_files
 from sceneexpander.ingest.sources import read_capture

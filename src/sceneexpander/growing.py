@@ -21,7 +21,7 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.metrics import MetricsRow, load_row
 from sceneexpander.artifacts.page import ScenePage
 from sceneexpander.artifacts.proposals import Proposals
-from sceneexpander.artifacts.store import ArtifactError, write_bytes_atomic
+from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.catalogue import MAIN
 from sceneexpander.catalogue.methods import CAPTURED
 from sceneexpander.config.compose import compose
@@ -39,6 +39,7 @@ from sceneexpander.expand import (
     inserted_name,
     scratch_folder,
 )
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.generation import backend_of
 from sceneexpander.ingest import make_round, read_picture
 from sceneexpander.pipeline.disk import remove_tree

@@ -172,7 +172,7 @@ def agree(requests: int, *, unattended: bool) -> None:
 
 
 def _save(judged: JudgedRound, judge: Judge) -> None:
-    from sceneexpander.artifacts.store import directory_being_written
+    from sceneexpander.files import directory_being_written
 
     with directory_being_written(Path("judged") / judged.scene / f"round_{judged.round}") as folder:
         judged.save(folder, judge.chat.requests)

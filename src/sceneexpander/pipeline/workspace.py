@@ -16,9 +16,9 @@ import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.config.overrides import key_of, written_out
 from sceneexpander.errors import UserError, interruptible, printable
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.disk import make_writable, remove_tree, require_room
 from sceneexpander.pipeline.locks import RunLock, file_lock
 from sceneexpander.pipeline.packages import LOCKS
