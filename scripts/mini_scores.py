@@ -28,7 +28,7 @@ from sceneexpander.models.weights import resolve_weights
 from sceneexpander.photometric.config import WarmupConfig
 from sceneexpander.photometric.report import FitReport
 from sceneexpander.photometric.warmup import warm_up
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.training.scores import (
     HEIGHT,
     INPUTS,

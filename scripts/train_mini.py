@@ -21,7 +21,7 @@ from sceneexpander.artifacts.page import flatten
 from sceneexpander.errors import entry_point
 from sceneexpander.models.mini import Mini, MiniConfig
 from sceneexpander.models.weights import resolve_weights
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.curve import CurveRun
 from sceneexpander.tracking.record import run_key

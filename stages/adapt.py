@@ -27,7 +27,7 @@ from sceneexpander.expansion import (
 )
 from sceneexpander.files import directory_being_written
 from sceneexpander.photometric.config import RefineConfig
-from sceneexpander.progress import progress_bar
+from sceneexpander.pipeline.progress import progress_bar
 from stages import layout
 from stages.machine import use_machine
 from stages.runner import Cell, checkpoint_folder, live_folder, remove_checkpoints, remove_folder, run_identity, stage

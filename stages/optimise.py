@@ -12,7 +12,7 @@ from sceneexpander.config.files import read_sections
 from sceneexpander.errors import UserError
 from sceneexpander.files import directory_being_written
 from sceneexpander.optimisation.config import OptimiseConfig
-from sceneexpander.progress import progress_bar
+from sceneexpander.pipeline.progress import progress_bar
 from stages import layout
 from stages.runner import Cell, checkpoint_folder, left_out, remove_checkpoints, run_identity, stage
 

@@ -11,7 +11,7 @@ from sceneexpander.files import directory_being_written
 from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.photometric.config import WarmupConfig
-from sceneexpander.progress import progress_bar
+from sceneexpander.pipeline.progress import progress_bar
 from sceneexpander.reconstruction.cameras import report_cameras
 from sceneexpander.reconstruction.initial import initial_state
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model

@@ -45,9 +45,9 @@ from sceneexpander.ingest import make_round, read_picture
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.locks import RunLock, run_lock
 from sceneexpander.pipeline.preflight import check_scene
+from sceneexpander.pipeline.selection import MOST_ROUNDS, PARAMS, Selection, check_name, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, reproduce
 from sceneexpander.plainfiles import require_plain_file
-from sceneexpander.selection import MOST_ROUNDS, PARAMS, Selection, check_name, read_selection
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,9 +21,9 @@ from sceneexpander.config.overrides import key_of, written_out
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point
+from sceneexpander.pipeline.project import JUDGED_FOLDER, find_project
+from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.plainfiles import require_folder
-from sceneexpander.project import JUDGED_FOLDER, find_project
-from sceneexpander.selection import Selection, read_selection
 
 if TYPE_CHECKING:
     from sceneexpander.artifacts.judgement import JudgedRound

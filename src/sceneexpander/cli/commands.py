@@ -41,7 +41,7 @@ COMMANDS = (
     ),
     Command(
         "convert",
-        "sceneexpander.models.convert_checkpoint",
+        "sceneexpander.convert_checkpoint",
         "convert a PyTorch checkpoint to safetensors, running no code",
     ),
     Command("check", "sceneexpander.cli.check", "look at params.yaml, conf/, photos and weights; run nothing"),

@@ -18,7 +18,7 @@ from configobj import ConfigObj, ConfigObjError
 
 from sceneexpander.errors import UserError
 from sceneexpander.files import write_bytes_atomic
-from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV
+from sceneexpander.pipeline.project import ERROR_FILE_ENV, ROOT_ENV
 from sceneexpander.tracking.store import without_foreign_settings
 
 _LEFT_OUT = ("HYDRA_", "DVC_", "PYTHON", "GIT_")

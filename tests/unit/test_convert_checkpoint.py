@@ -18,8 +18,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from sceneexpander.convert_checkpoint import ALLOWED, convert, main, read_checkpoint
 from sceneexpander.errors import UserError
-from sceneexpander.models.convert_checkpoint import ALLOWED, convert, main, read_checkpoint
 
 
 def write_archive(path: Path, data: bytes, storages: dict[str, bytes] | None = None, compressed: bool = False) -> Path:
