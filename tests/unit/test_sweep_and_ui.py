@@ -182,7 +182,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     "given",
     [
-        ["--finished"],
+        ["--finished", "--rows", "default"],
         ["--rows", ""],
         ["--rows", ","],
         ["--seeds", ""],
