@@ -21,6 +21,7 @@ from sceneexpander.exports.mesh import make_collider, make_mesh
 from sceneexpander.exports.scene import Crop, ExportScene, crop_scene, load_scene, place_scene
 from sceneexpander.exports.write import write_exports
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting import render
@@ -59,7 +60,7 @@ def written(scene: ExportScene, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def seen(scene: ExportScene) -> torch.Tensor:
     made = scene.reconstruction
-    return render(made.gaussians, made.world_from_cam, made.intrinsics_px, HEIGHT, WIDTH).rgb
+    return render(made.gaussians, Cameras(made.world_from_cam, made.intrinsics_px, HEIGHT, WIDTH)).rgb
 
 
 def seen_of(scene: ExportScene, path: Path) -> torch.Tensor:

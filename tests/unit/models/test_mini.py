@@ -12,6 +12,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gauge import priors_relative_to
 from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
@@ -286,7 +287,7 @@ def test_a_guess_gives_way_to_a_view_that_sees_the_place() -> None:
     sure = torch.full((40, 40), 2.0)
     for guess, expected in ((1.0, 1.0), (2.0, 1.0), (3.0, 0.0)):  # in front of the surface, on it, hidden behind it
         depth = torch.stack([torch.full((40, 40), guess), sure])
-        covered = covered_by_others(depth, confident, poses, intrinsics, posed, most_views=4)
+        covered = covered_by_others(depth, confident, Cameras(poses, intrinsics, 40, 40), posed, most_views=4)
         assert covered[0].unique().tolist() == [expected]
         assert covered[1].unique().tolist() == [0.0]
 
@@ -299,14 +300,14 @@ def test_cross_view_channels_tell_front_from_behind() -> None:
     posed = torch.ones(2, dtype=torch.bool)
     confident = torch.ones(2, 40, 40)
     log_depth = torch.log(torch.stack([torch.full((40, 40), 3.0), torch.full((40, 40), 2.0)]))
-    geometry = PairGeometry(log_depth, confident, poses, intrinsics, posed)
+    geometry = PairGeometry(log_depth, confident, Cameras(poses, intrinsics, 40, 40), posed)
     channels = geometry.compare(images, (0, 1), most_views=4)
     behind, in_front = channels[:, 2, 20, 20], channels[:, 3, 20, 20]
     ratio = torch.log(torch.tensor(1.5))
     torch.testing.assert_close(behind, torch.stack([ratio, torch.zeros(())]), atol=1e-5, rtol=0)
     torch.testing.assert_close(in_front, torch.stack([torch.zeros(()), ratio]), atol=1e-5, rtol=0)
     posed[1] = False
-    unposed = PairGeometry(log_depth, confident, poses, intrinsics, posed)
+    unposed = PairGeometry(log_depth, confident, Cameras(poses, intrinsics, 40, 40), posed)
     assert unposed.compare(images, (0, 1), most_views=4).abs().max() == 0
 
 
@@ -327,7 +328,7 @@ def test_what_is_measured_once_serves_every_subset(views: tuple[int, ...]) -> No
 def test_splatted_depth_keeps_the_nearest_point() -> None:
     intrinsics = torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]])
     points = torch.tensor([[0.01, 0.01, 4.0], [0.01, 0.01, 2.0], [0.0, 0.0, -1.0]])
-    found = splat_log_depth(points, rigid_inverse(torch.eye(4)), intrinsics, 10, 10)
+    found = splat_log_depth(points, Cameras(torch.eye(4)[None], intrinsics[None], 10, 10))
     assert int(found.isfinite().sum()) == 1
     assert found[5, 5].exp().item() == pytest.approx(2.0)
 

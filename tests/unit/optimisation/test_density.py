@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.optimisation.config import DensityConfig, RatesConfig
 from sceneexpander.optimisation.density import CloneAndSplit, Relocation, Schedule, Seen, shared_appearance
@@ -182,7 +183,7 @@ def test_the_dead_move_to_the_living_and_the_picture_stays() -> None:
     assert result.generated.all(), "what moved shows what the living one showed"
     torch.testing.assert_close(result.means, start.means[:1].expand(4, 3))
     camera = (cameras(1), intrinsics(1, 40, 60), 40, 60)
-    before, after = render(start.select(torch.tensor([0])), *camera), render(result, *camera)
+    before, after = render(start.select(torch.tensor([0])), Cameras(*camera)), render(result, Cameras(*camera))
     assert float((before.rgb - after.rgb).abs().max()) < 0.02 < 0.1 * float(before.rgb.max())
 
 

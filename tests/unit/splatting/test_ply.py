@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from sceneexpander.errors import UserError
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.splatting import render
 from sceneexpander.splatting.ply import read_ply, write_ply
@@ -63,7 +64,7 @@ def test_written_scenes_come_back_and_render_the_same(tmp_path: Path, sh_coeffic
     assert_same_scene(again, scene)
     assert torch.equal(again.source_view, scene.source_view)
     assert torch.equal(again.generated, scene.generated)
-    pictures = [render(s, cameras(1), intrinsics(1, 40, 50), 40, 50) for s in (scene, again)]
+    pictures = [render(s, Cameras(cameras(1), intrinsics(1, 40, 50), 40, 50)) for s in (scene, again)]
     assert (pictures[0].rgb - pictures[1].rgb).abs().max() < 1 / 255
     assert (pictures[0].generated - pictures[1].generated).abs().max() < 1 / 255
     assert [p.name for p in path.parent.iterdir()] == ["scene.ply"]  # no scratch files
