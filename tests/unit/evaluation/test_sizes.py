@@ -15,7 +15,7 @@ from sceneexpander.evaluation.sizes import at_sizes
 from sceneexpander.geometry.camera import resize_intrinsics
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import render
-from tests.unit.evaluation.made import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
+from tests.worlds.wall import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
 
 CONFIG = EvaluateConfig(st_lpips=False)
 PIXEL = DEPTH / 40

@@ -21,7 +21,7 @@ from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.evaluation.views import measure_views, navigation_coverage, same_place
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
-from tests.unit.evaluation.made import HEIGHT, WIDTH, made_reconstruction, own_pictures, without_generated
+from tests.worlds.wall import HEIGHT, WIDTH, made_reconstruction, own_pictures, without_generated
 
 CONFIG = EvaluateConfig()
 

@@ -27,7 +27,7 @@ from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting import render
 from sceneexpander.splatting.ply import read_ply
 from sceneexpander.splatting.spz import read_spz
-from tests.unit.exports.scenes import DEPTH, FINER, GENERATED, HEIGHT, VIEWS, WIDTH, poses, save_finished
+from tests.worlds.exported import DEPTH, FINER, GENERATED, HEIGHT, VIEWS, WIDTH, poses, save_finished
 
 NAMES = tuple(item.name for item in FORMATS)
 MOVED = Similarity(

@@ -19,7 +19,7 @@ from sceneexpander.optimisation.optimise import photometric_loss
 from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.refine import refine
 from sceneexpander.splatting import render
-from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
+from tests.worlds.spoiled import TRUTH, VIEWS, spoiled
 
 CONFIG = RefineConfig(visits=20, colours=0.1)  # fast colours: the start is grey
 IMAGES = VIEWS.images

@@ -12,7 +12,7 @@ from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.splatting import RasterSettings, Render, render
 from sceneexpander.splatting.kernel_backend import load_kernel
-from tests.unit.splatting.scenes import intrinsics
+from tests.worlds.random_gaussians import intrinsics
 
 H, W = 43, 57  # no multiples of the tile size
 needs_kernel = pytest.mark.skipif(load_kernel() is None, reason="no compiled kernel (no compiler at install)")

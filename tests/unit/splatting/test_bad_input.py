@@ -10,7 +10,7 @@ import torch
 
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import RasterSettings, rasterise, render
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 FIELDS = ("means", "quat_wxyz", "scales", "opacities", "sh")
 

@@ -20,7 +20,7 @@ from tests.unit.splatting.backends import (
     needs_kernel,
     settings,
 )
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 
 @needs_kernel

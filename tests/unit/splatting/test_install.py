@@ -17,7 +17,7 @@ from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import RasterSettings, kernel_backend, render
 from sceneexpander.splatting.kernel import recipe
 from sceneexpander.splatting.rasterise import active_backend
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 ROOT = Path(__file__).parents[3]
 KERNEL = "src/sceneexpander/splatting/kernel"

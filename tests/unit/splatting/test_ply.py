@@ -15,7 +15,7 @@ from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.splatting import render
 from sceneexpander.splatting.ply import read_ply, write_ply
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 XYZ, NORMALS, DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 SHAPE = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]

@@ -19,7 +19,7 @@ from sceneexpander.geometry.gaussians import ROWS, Gaussians
 from sceneexpander.geometry.rigid import rotation_angle_deg, rotation_from_quat_wxyz
 from sceneexpander.splatting import render
 from sceneexpander.splatting.spz import HEADER, MAGIC, read_spz, write_spz
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 
 def bounded(count: int, sh_coefficients: int = 4) -> Gaussians:

@@ -10,7 +10,7 @@ import torch
 from sceneexpander.geometry.rigid import look_at, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.viewer.cameras import ShownCameras, alignment, frustum_length, up_direction
-from tests.unit.rendering.test_tour import reconstruction
+from tests.worlds.row_of_views import reconstruction
 
 
 def cameras_around(up: torch.Tensor, count: int = 4) -> ShownCameras:

@@ -27,7 +27,7 @@ from sceneexpander.viewer.packed import (
     unpack_splats,
     visible_weight,
 )
-from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
+from tests.worlds.row_of_views import HEIGHT, WIDTH, reconstruction
 
 
 def random_scene(count: int = 400, *, coefficients: int = 1, seed: int = 0) -> Reconstruction:

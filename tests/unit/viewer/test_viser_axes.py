@@ -23,7 +23,7 @@ from sceneexpander.viewer.viser_axes import (
     viser_splats,
     widened,
 )
-from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
+from tests.worlds.row_of_views import HEIGHT, WIDTH, reconstruction
 
 STAY = Similarity(scale=1.0, rotation=torch.eye(3), translation=torch.zeros(3))
 
