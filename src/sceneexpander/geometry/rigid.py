@@ -118,7 +118,7 @@ def slerp_wxyz(
 
 
 def look_at(
-    eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*batch 3"], up: Float[Tensor, "*batch 3"]
+    eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """``world_from_cam`` (OpenCV axes) of a camera at ``eye`` that looks at ``target``; ``up`` points up in the world."""
     forward = torch.nn.functional.normalize(target - eye, dim=-1)

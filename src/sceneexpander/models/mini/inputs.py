@@ -42,8 +42,8 @@ class MeasuredPriors:
     known: Bool[Tensor, "view height width"] | None  # where there is a base depth; None: everywhere
     confident: Float[Tensor, "view height width"]  # 1 where the base is probably right
     posed: Bool[Tensor, "view"]
-    log_depth_fine: Float[Tensor, "view height width"]  # at the working resolution
-    confident_fine: Float[Tensor, "view height width"]
+    log_depth_fine: Float[Tensor, "view fine_height fine_width"]  # at the working resolution
+    confident_fine: Float[Tensor, "view fine_height fine_width"]
     coarse: Float[Tensor, "view channel out_height out_width"]  # all coarse channels but the cross-view ones
     base_normals: Float[Tensor, "view out_height out_width 3"]
     pairs: PairGeometry  # of all views that were measured together
