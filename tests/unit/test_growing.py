@@ -169,12 +169,12 @@ def test_an_unfinished_round_is_finished_first(run: Path, project: Path, monkeyp
     assert (started, rounds_of(run)) == ([run], before)
 
 
-def finish_round(run: Path, *, posed: bool, psnr_before: float, psnr_after: float) -> None:
+def finish_round(run: Path, *, posed: bool, before: dict[str, float], after: dict[str, float]) -> None:
     base = run / "outputs" / "room" / "round_1"
     inserted = view("n1", generated=True)
     provenance = Provenance(backend="replay", prompt="p", source="s", sha256="3" * 64)
     InsertedView(round=1, view=inserted, chosen=0, provenance=(provenance,)).save(base / "inserted")
-    for method, psnr in (("captured", psnr_before), ("sceneexpander", psnr_after)):
+    for method, values in (("captured", before), ("sceneexpander", after)):
         MetricsRow(
             scene="room",
             round=1,
@@ -182,7 +182,7 @@ def finish_round(run: Path, *, posed: bool, psnr_before: float, psnr_after: floa
             model="mini",
             weights_sha256="0",
             seed=0,
-            values={"psnr_captured_db": psnr},
+            values=values,
             views=(ViewMetrics(view_id="n1", generated=True, posed=posed),) if method != "captured" else (),
         ).save(base / "metrics" / f"{method}.json")
 
@@ -190,15 +190,19 @@ def finish_round(run: Path, *, posed: bool, psnr_before: float, psnr_after: floa
 @pytest.mark.parametrize(
     ("posed", "after", "reason"),
     [
-        (False, 24.9, "no camera could be estimated for its inserted view"),
-        (True, 21.5, "the captured views lost 3.5 dB (at most 3 are allowed)"),
-        (True, 22.5, None),
+        (False, (24.9, 19.9), "no camera could be estimated for its inserted view"),
+        (True, (21.5, 19.9), "the captured views lost 3.5 dB (at most 3 are allowed)"),
+        (True, (24.9, 16.0), "the views inserted earlier lost 4.0 dB (at most 3 are allowed)"),
+        (True, (22.5, 17.5), None),
     ],
 )
 def test_no_round_follows_one_that_failed(
-    posed: bool, after: float, reason: str | None, run: Path, project: Path
+    posed: bool, after: tuple[float, float], reason: str | None, run: Path, project: Path
 ) -> None:
-    finish_round(run, posed=posed, psnr_before=25.0, psnr_after=after)
+    names = "psnr_captured_db", "psnr_earlier_inserted_db"
+    finish_round(
+        run, posed=posed, before=dict(zip(names, (25.0, 20.0), strict=True)), after=dict(zip(names, after, strict=True))
+    )
     line = quality_line(growing.open_run("room", project), 1)
     assert line == (None if reason is None else f"round 1 failed quality control: {reason}")
     if reason is not None:
