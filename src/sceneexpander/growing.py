@@ -159,7 +159,7 @@ def add_round(name: str, request: RoundRequest, *, project: Path) -> Path | None
         RuntimeError: a stage failed for another reason.
     """
     run = open_run(name, project)
-    with run_lock(run.folder) as lock:
+    with run_lock(run.folder, what=run.folder) as lock:
         run = open_run(name, project)  # as it is, now that nobody else changes it
         if request.is_empty:
             if run.is_finished:
@@ -184,7 +184,7 @@ def undo_round(name: str, *, project: Path) -> Path:
         UserError: there is no such run, it has one round only, or somebody else works on it.
     """
     run = open_run(name, project)
-    with run_lock(run.folder) as lock:
+    with run_lock(run.folder, what=run.folder) as lock:
         run = open_run(name, project)
         rounds = run.selection.rounds - 1
         if rounds < 1:

@@ -107,6 +107,18 @@ def test_a_branch_is_not_replaced_by_other_photos(run: Path, project: Path, tmp_
         expand(request(tmp_path / "photos", tmp_path, name="b"), project=project)
 
 
+def test_the_first_command_again_loses_no_added_round(run: Path, project: Path, tmp_path: Path) -> None:
+    again = request(tmp_path / "photos", tmp_path, name="room")
+    add_round("room", LEFT, project=project)
+    before = without_locks(project)
+    with pytest.raises(UserError, match="has rounds that were added to it; go on with --continue"):
+        expand(again, project=project)
+    assert without_locks(project) == before
+    undo_round("room", project=project)
+    expand(again, project=project)
+    assert len(rounds_of(run)) == 1
+
+
 @pytest.mark.parametrize(
     ("name", "asked", "line"),
     [
@@ -150,7 +162,7 @@ def test_a_refused_round_changes_nothing(run: Path, project: Path, monkeypatch: 
 def test_somebody_elses_run_is_left_alone(run: Path, project: Path) -> None:
     before = everything(run)
     with somebody_at_work(run):
-        with pytest.raises(UserError, match="is being worked on"):
+        with pytest.raises(UserError, match="is being worked on .*; wait for it or end it$"):
             add_round("room", LEFT, project=project)
         with pytest.raises(UserError, match="is being worked on"):
             undo_round("room", project=project)
