@@ -202,6 +202,9 @@ def proposal_lines(name: str, from_round: int | None, *, project: Path) -> list[
     """
     run = open_run(name, project)
     number = _known_round(run, from_round)
+    if number == 0:
+        problem = "0 is the captured scene, and proposals are made after rounds"
+        raise UserError(problem, where="--from-round", fix="name round 1 or a later one")
     place = run.outputs / f"round_{number}" / "proposals"
     if not place.is_dir():
         raise UserError(f"has no proposals after round {number}", where=run.folder, fix=f"finish it: --continue {name}")

@@ -162,7 +162,7 @@ def test_a_refused_round_changes_nothing(run: Path, project: Path, monkeypatch: 
 def test_somebody_elses_run_is_left_alone(run: Path, project: Path) -> None:
     before = everything(run)
     with somebody_at_work(run):
-        with pytest.raises(UserError, match="is being worked on .*; wait for it or end it$"):
+        with pytest.raises(UserError, match=r"is being worked on .*; wait for it or end it$"):
             add_round("room", LEFT, project=project)
         with pytest.raises(UserError, match="is being worked on"):
             undo_round("room", project=project)
@@ -258,5 +258,7 @@ def test_the_words_become_a_round() -> None:
 
 
 def test_proposals_of_a_round_that_has_none_are_refused(run: Path, project: Path) -> None:
-    with pytest.raises(UserError, match="has no proposals after round 1"):
+    with pytest.raises(UserError, match="has no proposals after round 1; finish it"):
         proposal_lines("room", None, project=project)
+    with pytest.raises(UserError, match="is the captured scene, and proposals are made after rounds; name round 1"):
+        proposal_lines("room", 0, project=project)
