@@ -131,7 +131,7 @@ def find_apart_group(mapping: Mapping, costs: Float[np.ndarray, "view view"]) ->
     return best[1]
 
 
-def mean_cost(costs: Float[np.ndarray, "view view"]) -> float:
+def mean_cost(costs: Float[np.ndarray, "*pair"]) -> float:
     """Over all pairs; 1 without any."""
     return float(np.nanmean(costs)) if np.isfinite(costs).any() else 1.0
 

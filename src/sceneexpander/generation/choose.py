@@ -35,7 +35,7 @@ class ChosenView:
 
     inserted: InsertedView
     sheet: Float[Tensor, "3 height width"]
-    overlay: Float[Tensor, "3 height width3"] | None
+    overlay: Float[Tensor, "3 overlay_height overlay_width"] | None
 
 
 def choose_view(

@@ -43,7 +43,7 @@ class Misaligned:
 
     report: MisalignmentReport
     support: Float[Tensor, "height width"] | None = None
-    overlay: Float[Tensor, "3 height width3"] | None = None
+    overlay: Float[Tensor, "3 overlay_height overlay_width"] | None = None
 
 
 @torch.no_grad()

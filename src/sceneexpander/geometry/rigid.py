@@ -92,7 +92,7 @@ def quat_wxyz_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tens
 
 
 def rotation_angle_deg(
-    rotation_a: Float[Tensor, "*batch 3 3"], rotation_b: Float[Tensor, "*batch 3 3"]
+    rotation_a: Float[Tensor, "*#batch 3 3"], rotation_b: Float[Tensor, "*#batch 3 3"]
 ) -> Float[Tensor, "*batch"]:
     """Geodesic angle between two rotations, in degrees; accurate near 0 and near 180."""
     relative = rotation_a.transpose(-1, -2) @ rotation_b

@@ -88,6 +88,7 @@ def test_masks() -> None:
     assert psnr(a, outside, mask) == pytest.approx(psnr(a, b, mask), abs=1e-9)
 
 
+@pytest.mark.wrong_shapes
 def test_refusals() -> None:
     a, b = pair()
     nothing = torch.zeros(a.shape[1:], dtype=torch.bool)

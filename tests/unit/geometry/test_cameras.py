@@ -105,6 +105,7 @@ def test_points_behind_or_beside_a_camera_are_not_in_frame() -> None:
     assert sample_at(torch.ones(1, 1, 4, 6), found.grid).isfinite().all()
 
 
+@pytest.mark.wrong_shapes
 def test_what_does_not_go_together_is_refused() -> None:
     cameras = some_cameras(0)
     with pytest.raises(ValueError, match="world_from_cam has shape"):

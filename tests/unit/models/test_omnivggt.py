@@ -178,6 +178,7 @@ def test_missing_depth_is_masked_and_does_not_count_for_the_mean() -> None:
         ({"intrinsics_px": torch.full((VIEWS, 3, 3), torch.nan)}, "intrinsics_px of view 0 is not finite"),
     ],
 )
+@pytest.mark.wrong_shapes
 def test_priors_that_contradict_the_images_are_named(model: OmniVGGT, change: dict[str, Tensor], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         run(model, replace(all_priors(), **change))

@@ -219,6 +219,7 @@ def test_normals_of_a_plane_are_its_own_and_face_the_camera() -> None:
 
 
 @pytest.mark.parametrize("name", ["depth", "depth_conf"])
+@pytest.mark.wrong_shapes
 def test_maps_of_another_size_are_named(name: str) -> None:
     images, depth, poses, intrinsics = slanted_plane()
     maps = {"depth": depth, "depth_conf": torch.full_like(depth, 2.0)}

@@ -254,6 +254,7 @@ def test_gradients_reach_the_first_view_through_the_rate(model: TTT3R) -> None:
     model.zero_grad(set_to_none=True)
 
 
+@pytest.mark.wrong_shapes
 def test_bad_input_is_refused(model: TTT3R) -> None:
     with pytest.raises(UserError, match="there are no views"):
         model.predict(torch.zeros(0, 3, HEIGHT, WIDTH))

@@ -229,6 +229,7 @@ def test_only_the_first_view_is_special(model: WorldMirror) -> None:
     assert not torch.allclose(a.depth[0], swapped.depth[1], rtol=1e-3)
 
 
+@pytest.mark.wrong_shapes
 def test_sizes_that_do_not_fit_are_refused(model: WorldMirror) -> None:
     with pytest.raises(ValueError, match="30 x 42 is not a multiple of 14"):
         model.predict(random_images(1, 30, 42))

@@ -53,6 +53,7 @@ def test_impossible_image_sizes_are_refused(height: int, width: int) -> None:
         render(random_gaussians(3), Cameras(cameras(1), intrinsics(1, 8, 8), height, width))
 
 
+@pytest.mark.wrong_shapes
 def test_wrong_shapes_are_named() -> None:
     scene, k = random_gaussians(3), intrinsics(1, 8, 8)
     with pytest.raises(ValueError, match=r"scales has shape \(3, 2\), expected \(3, 3\)"):

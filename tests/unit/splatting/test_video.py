@@ -79,6 +79,7 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path, count: int, height:
         ([torch.zeros(3, 8, 8, dtype=torch.int64)], "frame 0 is torch.int64"),
     ],
 )
+@pytest.mark.wrong_shapes
 def test_bad_frames_are_named_and_leave_no_file(tmp_path: Path, frames: list[Tensor], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         write_video(frames, tmp_path / "tour.mp4", 24)
