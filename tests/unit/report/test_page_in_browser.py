@@ -14,10 +14,9 @@ from sceneexpander.artifacts.proposals import Proposal, Proposals
 from sceneexpander.catalogue import MAIN
 from sceneexpander.report import SceneSource, collect_scene, write_page
 from tests.support.browser import Page, browser_page
-from tests.unit.report.test_cameras import with_cameras
-from tests.unit.report.test_page import row, source
+from tests.worlds.reports import row
+from tests.worlds.reports_with_cameras import with_cameras
 
-__all__ = ["source"]
 WIDE, NARROW = 1280, 390
 VIEWS = ("a_photo_with_quite_a_long_name", "v0", "v1", "v2")
 # Elements that stick out, or that scroll within themselves.
