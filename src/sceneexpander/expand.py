@@ -15,7 +15,7 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -358,7 +358,7 @@ def expand(request: Request, *, project: Path) -> Path | None:
         check_source(folder, request)
         with scratch_folder(folder) as scratch:
             scene = scratch / name
-            with _shown_as_given(scene, request):
+            with shown_as_given(_originals(scene, request)):
                 stage_scene(request, name, scene, ingest=config.scene, recorded=recorded)
                 checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
             announce_forecasts(checked.forecasts, config.generator.backend, details=request.dry_run)
@@ -422,18 +422,22 @@ def choice_lines(folder: Path, name: str, rounds: int) -> list[str]:
     return lines
 
 
+def _originals(scene: Path, request: Request) -> dict[Path, Path]:
+    """Where the parts of a scene that was put together come from."""
+    if (request.photos / SCENE_FILE).is_file():
+        return {scene: request.photos}
+    pictures = {scene / inserted_name(k, path): path for k, path in enumerate(request.inserted, start=1)}
+    return {**pictures, scene / "captured": request.photos, scene: request.photos}
+
+
 @contextmanager
-def _shown_as_given(scene: Path, request: Request) -> Iterator[None]:
-    """Errors about the copy of a scene name the file that it was copied from."""
+def shown_as_given(originals: Mapping[Path, Path]) -> Iterator[None]:
+    """Errors about a copy name the file that it was copied from. ``originals`` by copy, what lies inside others first."""
     try:
         yield
     except UserError as error:
-        originals: dict[Path, Path] = {}
-        if not (request.photos / SCENE_FILE).is_file():
-            originals |= {scene / inserted_name(k, path): path for k, path in enumerate(request.inserted, start=1)}
-            originals[scene / "captured"] = request.photos
         where, problem = error.where or "", error.problem
-        for copy, original in {**originals, scene: request.photos}.items():
+        for copy, original in originals.items():
             where, problem = where.replace(str(copy), str(original)), problem.replace(str(copy), str(original))
         raise UserError(problem, where=where or None, fix=error.fix) from None
 

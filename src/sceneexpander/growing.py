@@ -38,6 +38,7 @@ from sceneexpander.expand import (
     announce_forecasts,
     inserted_name,
     scratch_folder,
+    shown_as_given,
 )
 from sceneexpander.files import write_bytes_atomic
 from sceneexpander.generation import backend_of
@@ -307,21 +308,24 @@ def _grow(run: Run, folder: Path, number: int, request: RoundRequest, project: P
         facts = {"prompt": spec.prompt, "motion": spec.motion, "object": spec.new_object}
         entry = {key: text for key, text in facts.items() if text}
         scene = _copied_scene(run, scratch, number)
+        originals = {scene: run.source}
         if request.inserted is not None:
             picture = inserted_name(number + 1, request.inserted)
             (scene / picture).parent.mkdir(exist_ok=True)
             shutil.copyfile(request.inserted, scene / picture)
             entry["inserted"] = picture.as_posix()
+            originals = {scene / picture: request.inserted, **originals}
         _write_rounds(scene, [*_read_rounds(scene)["rounds"], entry])
-        checked = check_scene(
-            run.scene,
-            scene,
-            conf=project / "conf",
-            overrides=selection.overrides,
-            rounds=selection.rounds,
-            round_overrides=selection.round_overrides,
-            methods=selection.methods,
-        )
+        with shown_as_given(originals):
+            checked = check_scene(
+                run.scene,
+                scene,
+                conf=project / "conf",
+                overrides=selection.overrides,
+                rounds=selection.rounds,
+                round_overrides=selection.round_overrides,
+                methods=selection.methods,
+            )
         new = checked.forecasts[-1:]
         backend = _config(run, own, project).generator.backend
         announce_forecasts(new, backend, details=request.dry_run, first=number + 1)

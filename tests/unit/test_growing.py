@@ -147,15 +147,23 @@ def test_what_cannot_be_is_one_line_and_changes_nothing(
     assert without_locks(project) == before
 
 
-def test_a_refused_round_changes_nothing(run: Path, project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: Any, **__: Any) -> CheckedScene:
-        raise UserError("is unusable")
+def test_a_refused_round_changes_nothing(
+    run: Path, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: str, scene: Path, **__: Any) -> CheckedScene:
+        raise UserError("is unusable", where=next(scene.glob("inserted/round_2*"), scene))
 
     monkeypatch.setattr(growing, "check_scene", refuse)
     before = without_locks(project)
-    for asked in (LEFT, RoundRequest(motion="turn left", settings=LEFT.settings, branch="b")):
-        with pytest.raises(UserError, match="is unusable"):
+    lake = picture(tmp_path / "lake.png")
+    for asked, where in (
+        (LEFT, run / "scenes" / "room"),
+        (RoundRequest(motion="turn left", settings=LEFT.settings, branch="b"), run / "scenes" / "room"),
+        (RoundRequest(prompt="A lake.", inserted=lake), lake),
+    ):
+        with pytest.raises(UserError) as caught:
             add_round("room", asked, project=project)
+        assert caught.value.line() == f"{where}: is unusable", "never the name of a copy"
     assert without_locks(project) == before
 
 

@@ -33,11 +33,12 @@ class Host:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageRun:
-    """One run of a stage: when it started (seconds since 1970), wall time, highest memory in MiB."""
+    """One run of a stage: when it started (seconds since 1970), wall time, time of all its processors, highest memory in MiB."""
 
     started: float
     wall_s: float
     peak_rss_mb: float
+    cpu_s: float | None = None
     host: Host | None = None
 
 

@@ -46,11 +46,12 @@ class HeatRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeatColumn:
-    """The scene at one time; ``label`` says which. ``drift``, ``time`` and ``memory`` are texts, empty where there is none."""
+    """The scene at one time; ``label`` says which. The others are texts, empty where there is none."""
 
     label: str
     drift: str = ""
     time: str = ""
+    cpu_time: str = ""
     memory: str = ""
 
 
@@ -131,6 +132,7 @@ def _column(number: int, page: RoundPage | None, drifts: Mapping[str, float]) ->
         label=f"round {number}",
         drift=f"{sum(older) / len(older):+.2f}" if older else "",
         time=f"{sum(run.wall_s for run in runs):.0f}" if runs else "",
+        cpu_time=f"{sum(busy):.0f}" if (busy := [run.cpu_s for run in runs if run.cpu_s is not None]) else "",
         memory=f"{max(run.peak_rss_mb for run in runs):.0f}" if runs else "",
     )
 

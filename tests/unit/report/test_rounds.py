@@ -38,8 +38,8 @@ def rounds(source: SceneSource, tmp_path: Path) -> list[RoundPage]:
     collect_scene(source, tmp_path / "room")
     page = ScenePage.load(tmp_path / "room").rounds[0]
     runs = {
-        "adapt": StageRun(started=0, wall_s=2.0, peak_rss_mb=90),
-        "render": StageRun(started=2, wall_s=3.0, peak_rss_mb=70),
+        "adapt": StageRun(started=0, wall_s=2.0, cpu_s=3.5, peak_rss_mb=90),
+        "render": StageRun(started=2, wall_s=3.0, cpu_s=4.5, peak_rss_mb=70),
     }
     return [replace(page, number=number, inserted_id=f"n{number}", statistics=runs) for number in (1, 2)]
 
@@ -59,7 +59,7 @@ def test_drift_is_counted_from_when_a_view_was_new(rounds: list[RoundPage]) -> N
     ]
     assert [item.label for item in shown.columns] == ["before", "round 1", "round 2"]
     assert [item.drift for item in shown.columns] == ["", "-1.00", "-1.67"], "the round's own view is not older"
-    assert [(item.time, item.memory) for item in shown.columns] == [("", ""), ("5", "90"), ("5", "90")]
+    assert [(item.time, item.cpu_time, item.memory) for item in shown.columns] == [("",) * 3, *[("5", "8", "90")] * 2]
     assert shown.rows[2].cells[2].lost
     assert shown.rows[2].cells[2].strength == 1.0
     titles = re.findall(r"<title>([^<]*)</title>", shown.curve)
