@@ -56,10 +56,12 @@ class CameraReport:
         return sum(view.posed for view in self.views)
 
     def summary(self) -> str:
-        """One line: "4 of 5 photos used: c.jpg left out (its matches agree with no camera)"."""
+        """One line: "4 of 5 photos used, 1 of them roughly: c.jpg left out (its matches agree with no camera)"."""
         out = [f"{view.name} left out ({view.reason})" for view in self.views if not view.posed]
         kind = "views" if any(view.generated for view in self.views) else "photos"
-        return f"{self.posed} of {len(self.views)} {kind} used" + (f": {'; '.join(out)}" if out else "")
+        rough = sum(view.posed and view.rough for view in self.views)
+        how = "" if not rough else ", all of them roughly" if rough == self.posed else f", {rough} of them roughly"
+        return f"{self.posed} of {len(self.views)} {kind} used{how}" + (f": {'; '.join(out)}" if out else "")
 
     def problems(self) -> tuple[str, ...]:
         """A line for everything that is not as it should be: views left out or rough, warnings, notes."""
@@ -67,8 +69,12 @@ class CameraReport:
         return (*lost, *self.remarks())
 
     def remarks(self) -> tuple[str, ...]:
-        """What `summary` does not say: views that are only roughly right, warnings, notes."""
-        lines = [f"{view.name}: roughly placed, {view.reason}" for view in self.views if view.posed and view.reason]
+        """What `summary` does not say: views that are only roughly right, a line for each reason, warnings, notes."""
+        rough: dict[str, list[str]] = {}
+        for view in self.views:
+            if view.posed and view.reason:
+                rough.setdefault(view.reason, []).append(view.name)
+        lines = [f"{', '.join(names)}: roughly placed, {reason}" for reason, names in rough.items()]
         lines += [f"{view.name}: {warning}" for view in self.views for warning in view.warnings]
         return (*lines, *self.notes)
 

@@ -49,6 +49,11 @@ class LensFacts:
     exif_size: tuple[int, int] | None = None
 
 
+def has_panorama_shape(height: int, width: int) -> bool:
+    """Whether a picture is exactly twice as wide as high, as 360 x 180 degrees are; small ones are not asked."""
+    return width >= 1000 and abs(width / height - 2) <= 0.005
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRecord:
     """Where a view came from. ``stored_from_original`` maps original to stored pixel coordinates (corner origin, 2x3).
@@ -67,6 +72,12 @@ class ViewRecord:
     round: int = 0  # 0: captured; k: inserted in round k
     lens: LensFacts | None = None
     distortion: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def may_be_panorama(self) -> bool:
+        """Whether a photo has the shape of a panorama all around and its file names no lens; it could also be cut to that shape."""
+        named = self.lens is not None and self.lens.focal_px is not None
+        return not self.generated and not named and has_panorama_shape(self.original_height, self.original_width)
 
     def original_from_stored(self) -> Affine:
         """The inverse map, from stored to original pixel coordinates."""

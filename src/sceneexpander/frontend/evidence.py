@@ -123,6 +123,28 @@ def weigh_evidence(
     return found
 
 
+def common_doubt(photos: int, *, sure: int, depth: bool, focal_is_guess: bool) -> str:
+    """Why all cameras of a set are only roughly right; empty without a reason.
+
+    Args:
+        photos: number of photos with a camera.
+        sure: as many of them have nothing of their own that speaks against theirs. A camera is only known against others: one that is
+            sure says little among others that are rough.
+        depth: whether any two of them differ by more than a homography.
+        focal_is_guess: nothing tells the focal length, neither files nor lines nor enough parallax.
+    """
+    if not depth:
+        return (
+            "what the photos share is one picture zoomed, cropped or stretched, or one flat surface:"
+            " there is no depth to tell cameras by"
+        )
+    if focal_is_guess:
+        return "the focal length is a guess, and the directions between cameras depend on it"
+    if sure < photos and (sure < 2 or 2 * sure < photos):
+        return "the cameras of most photos that it is placed by are only roughly right"
+    return ""
+
+
 def other_views(
     mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]
 ) -> list[OtherView]:

@@ -33,6 +33,7 @@ class ViewOptics:
         lens: a text that is equal for photos of one camera, lens and zoom; empty if the file does not say.
         focal_px: focal length in original pixels as the file has it; None without.
         generated: the picture was generated and shares no lens with anything.
+        doubt: why no pinhole camera may have taken it; empty without a reason.
     """
 
     original_size: tuple[int, int]
@@ -40,6 +41,7 @@ class ViewOptics:
     lens: str = ""
     focal_px: float | None = None
     generated: bool = False
+    doubt: str = ""
 
     @classmethod
     def of_whole_image(cls, height: int, width: int) -> ViewOptics:
@@ -78,6 +80,7 @@ class LensPlan:
     originals_px: Float[np.ndarray, " view"]  # long side of the original in its own pixels
     focal_hints: Float[np.ndarray, " lens"]  # over the long side, NaN without
     generated: np.ndarray  # per view
+    doubts: tuple[str, ...]  # per view why no pinhole camera may have taken it; empty without a reason
     starts: tuple[FocalStart, ...]
     nominal: Float[np.ndarray, "view 3 3"]  # for decisions that any plausible focal serves
     known: Float[np.ndarray, "view 3 3"] | None  # given intrinsics
@@ -171,6 +174,7 @@ class LensPlan:
             originals_px=np.array([own.long_side for own in optics], np.float64),
             focal_hints=hints,
             generated=np.array([own.generated for own in optics]),
+            doubts=tuple(own.doubt for own in optics),
             starts=_starts(
                 config,
                 hints[main],

@@ -343,7 +343,7 @@ class CameraSearch:
         features, plan, config, setup = self.features, self.plan, self.config, self.setup
         scored: list[tuple[bool, float, PairMatches]] = []
         for pair, kind in zip(self.pairs, self.found.kinds, strict=True):
-            if kind is not PairKind.PARALLAX:
+            if kind not in (PairKind.PARALLAX, PairKind.FLAT):
                 continue
             a, b = pair.view_a, pair.view_b
             pose = relative_pose(

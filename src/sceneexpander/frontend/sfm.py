@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sceneexpander.frontend.appearance import find_overlay, group_alike, looks_mirrored, patch_agreement
 from sceneexpander.frontend.distortion import Distortion
-from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
+from sceneexpander.frontend.evidence import ViewEvidence, common_doubt, weigh_evidence
 from sceneexpander.frontend.features import Features, lie_in
 from sceneexpander.frontend.known_check import compare_with_matches
 from sceneexpander.frontend.lens_tests import find_distortion, rival_lens_deg
@@ -45,6 +45,7 @@ from sceneexpander.frontend.sfm_types import (
 from sceneexpander.frontend.twoview import (
     PairMatches,
     fit_rotation,
+    homography_share,
     match_and_verify,
     rotation_focal,
     scaled_focal,
@@ -208,14 +209,31 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
         if refused and mapping.registered.sum() >= 2:
             mapping.finish(refine_focal=model.focal_source is FocalSource.REFINED)
     known_views = np.flatnonzero(mapping.registered).tolist() or [0]
-    for view in np.flatnonzero(~mapping.registered)[:_MOST_MIRRORS].tolist():
+    # Where two photos are all there is, nothing else contradicts the matches that a picture has with its mirrored copy.
+    pair = known_views[1:] if len(known_views) == 2 and evidence else []
+    for view in [*np.flatnonzero(~mapping.registered).tolist(), *pair][:_MOST_MIRRORS]:
         if view not in refused and looks_mirrored(
             view, known_views, setup.greys, model.features, model.pairs, config, unit_px=setup.unit_px, seed=setup.seed
         ):
             refused[view] = "it is mirrored: flip it left to right"
+            if mapping.registered[view]:
+                mapping.leave_out(view)
     doubts = {
-        view: reason for view, found in evidence.items() if view not in refused and (reason := found.doubt(config))
+        view: reason
+        for view, found in evidence.items()
+        if view not in refused and (reason := plan.doubts[view] or found.doubt(config))
     }
+    if evidence:
+        photos = [view for view in np.flatnonzero(mapping.registered).tolist() if not plan.generated[view]]
+        depth = _shows_depth(model, mapping)
+        common = common_doubt(
+            len(photos),
+            sure=sum(view not in doubts for view in photos),
+            depth=depth,
+            focal_is_guess=model.focal_source is FocalSource.ASSUMED,
+        )
+        # Without depth, whatever else is wrong with a camera comes of that.
+        doubts |= {view: (doubts.get(view, "") if depth else "") or common for view in photos if common}
     nothing_seen = not mapping.valid.any()
     if not mapping.registered.any():
         mapping.registered[0] = True  # the frame of reference, with or without others
@@ -253,6 +271,14 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
         doubts=doubts,
         unrelated=unrelated,
         notes=_notes(model, setup),
+    )
+
+
+def _shows_depth(model: _Model, mapping: Mapping) -> bool:
+    """Whether any two registered views differ by more than a homography."""
+    return any(
+        kind is PairKind.PARALLAX and mapping.registered[pair.view_a] and mapping.registered[pair.view_b]
+        for pair, kind in zip(model.pairs, model.kinds, strict=True)
     )
 
 
@@ -481,8 +507,26 @@ def _pair_kinds(
             elif (a, b) in turns and found is not None:
                 factor = found
         rotation_only |= (a, b) in turns
-        kinds.append(PairKind.ROTATION if rotation_only else PairKind.PARALLAX)
         if rotation_only:
             factors.append(factor)
+        kinds.append(PairKind.ROTATION if rotation_only else _kind_of_motion(pair, features, config, setup))
     distinct = len(features) - sum(len(views) - 1 for views in group_alike(features, pairs, setup.unit_px))
     return PairKinds(kinds=kinds, distinct=distinct, turning_focal=float(np.median(factors)) if factors else None)
+
+
+def _kind_of_motion(pair: PairMatches, features: list[Features], config: SfmConfig, setup: Setup) -> PairKind:
+    """Whether a pair that did not only turn shows depth.
+
+    Learned keypoints are asked only where descriptors say too little: their noise looks like relief.
+    """
+    a, b, matches = features[pair.view_a], features[pair.view_b], pair.verified
+    exact = matches.select(matches.index_a < a.described)
+    if exact.count < config.min_pair_inliers:
+        exact = matches
+    share = homography_share(
+        a.pixel_xy[exact.index_a],
+        b.pixel_xy[exact.index_b],
+        threshold_px=config.epipolar_px * setup.unit_px,
+        seed=setup.seed,
+    )
+    return PairKind.FLAT if share >= config.flat_share else PairKind.PARALLAX

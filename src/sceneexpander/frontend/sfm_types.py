@@ -80,6 +80,7 @@ class SfmConfig:
     rotation_share: Share = 0.8  # rotation-only: a pure rotation explains this share of the verified matches
     rotation_share_free_focal: Share = 0.9  # the same at the focal that suits the pair best
     rotation_px: Annotated[float, Range(0, 1000, low_open=True)] = 2.5
+    flat_share: Share = 0.9  # without depth: a homography explains this share of the verified matches, at `epipolar_px`
 
     # Focal length, in units of the original's long side.
     focal_starts: tuple[_Focal, ...] = (0.35, 0.48, 0.62, 0.78, 0.98, 1.25, 1.7, 2.5)
@@ -174,6 +175,7 @@ class PairKind(StrEnum):
 
     UNRELATED = "unrelated"  # too few matches agree on any geometry
     PARALLAX = "parallax"  # an essential matrix explains clearly more than a rotation does
+    FLAT = "flat"  # a homography explains nearly all matches: one picture zoomed, cropped or stretched, or one flat surface
     ROTATION = "rotation"  # a pure rotation explains nearly all matches: no depth from this pair
 
 

@@ -291,6 +291,25 @@ def fit_rotation(
     return best, best_inlier
 
 
+def homography_share(
+    xy_a: Float[np.ndarray, "match 2"],
+    xy_b: Float[np.ndarray, "match 2"],
+    *,
+    threshold_px: float,
+    seed: int,
+) -> float:
+    """Share of the matches that one homography takes to within ``threshold_px``; 0 without one."""
+    if len(xy_a) < 8:
+        return 0.0
+    found = _robust_matrix(cv2.findHomography, xy_a, xy_b, usac_parameters(threshold_px, seed))
+    if found is None:
+        return 0.0
+    moved = np.concatenate([xy_a, np.ones((len(xy_a), 1))], 1) @ found[0].T
+    with np.errstate(divide="ignore", invalid="ignore"):  # points on the vanishing line agree with nothing
+        error = np.linalg.norm(moved[:, :2] / moved[:, 2:] - xy_b, axis=1)
+    return float((error < threshold_px).mean())
+
+
 def rotation_focal(
     xy_a: Float[np.ndarray, "match 2"],
     xy_b: Float[np.ndarray, "match 2"],

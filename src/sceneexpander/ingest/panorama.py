@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 
+from sceneexpander.artifacts.views import has_panorama_shape
 from sceneexpander.ingest.samples import Pixels
 
 _LONGEST_STRIP = 3.0  # sides
@@ -46,7 +47,7 @@ def panorama_reason(pixels: Pixels, xmp: str, *, has_lens: bool) -> str | None:
 
 def doubtful_shape(height: int, width: int, *, has_lens: bool) -> str | None:
     """A note about a picture that has the shape of a panorama all around, but could be a photo; or None."""
-    if has_lens or width < 1000 or abs(width / height - 2) > 0.005:
+    if has_lens or not has_panorama_shape(height, width):
         return None
     return "is exactly twice as wide as high and its file names no lens: if it is a panorama, take it out, the cameras would be wrong"
 

@@ -10,6 +10,8 @@ from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.frontend.lenses import ViewOptics
 
+_MAY_BE_PANORAMA = "it is exactly twice as wide as high, as panorama pictures are, and its file names no lens"
+
 
 def optics_of(views: ViewSet) -> tuple[ViewOptics, ...]:
     """Per view how its stored picture lies on the original, and what its file says of the lens."""
@@ -63,4 +65,5 @@ def _optics(record: ViewRecord) -> ViewOptics:
         lens=lens,
         focal_px=focal_px,
         generated=record.generated,
+        doubt=_MAY_BE_PANORAMA if record.may_be_panorama else "",
     )

@@ -10,7 +10,7 @@ import sfm_worlds as worlds
 from test_epipolar import model_of, noisy, seen_through
 
 from sceneexpander.frontend.bundle import rotation_exp
-from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
+from sceneexpander.frontend.evidence import ViewEvidence, common_doubt, weigh_evidence
 from sceneexpander.frontend.lens_tests import find_apart_group, pair_costs, rival_lens_deg
 from sceneexpander.frontend.mapping import directions_between_deg
 from sceneexpander.frontend.search import CameraSearch
@@ -196,3 +196,26 @@ def test_a_long_lens_that_got_stuck_is_moved_on_and_says_what_else_fits() -> Non
     assert moved.score() > model.score()
     np.testing.assert_allclose(moved.log_focal[0], right.log_focal[0], atol=0.01)
     assert 0 < moved.spread_deg.max() < CONFIG.max_spread_deg
+
+
+@pytest.mark.parametrize(
+    ("photos", "sure", "doubted"),
+    [
+        (5, 5, False),
+        (5, 4, False),
+        (5, 3, False),
+        (5, 2, True),
+        (5, 1, True),
+        (5, 0, True),
+        (2, 2, False),
+        (2, 1, True),
+        (1, 1, False),
+    ],
+)
+def test_no_camera_is_sure_among_others_that_are_rough(photos: int, sure: int, doubted: bool) -> None:
+    assert bool(common_doubt(photos, sure=sure, depth=True, focal_is_guess=False)) == doubted
+
+
+def test_no_camera_is_sure_without_depth_or_a_focal() -> None:
+    assert "no depth" in common_doubt(5, sure=5, depth=False, focal_is_guess=False)
+    assert "focal" in common_doubt(5, sure=5, depth=True, focal_is_guess=True)

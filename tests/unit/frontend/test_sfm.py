@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import dense_scenes as scenes
 import numpy as np
 import pytest
@@ -10,10 +12,11 @@ import torch
 
 from sceneexpander.errors import UserError
 from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
+from sceneexpander.frontend.lenses import ViewOptics
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.resection import solve_pose
 from sceneexpander.frontend.sfm import SfmConfig, estimate_cameras
-from sceneexpander.frontend.sfm_types import FocalSource, PairKind, SparseReconstruction
+from sceneexpander.frontend.sfm_types import FocalSource, LearnedUse, PairKind, SparseReconstruction
 from sceneexpander.frontend.tracks import Tracks
 from sceneexpander.frontend.twoview import relative_pose
 from sceneexpander.geometry.camera import project_points
@@ -21,6 +24,7 @@ from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 290.0
 FAST = SfmConfig(max_features=1000, learned_features=512, learned_long_side_px=640)
+FASTEST = replace(FAST, learned=LearnedUse.NEVER)
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -300,6 +304,37 @@ def test_the_same_picture_twice_does_not_crash(scene: scenes.Scene) -> None:
     found = estimate_cameras(twice, FAST, generator=generator())
     assert torch.isfinite(found.world_from_cam).all()
     torch.testing.assert_close(found.world_from_cam[1], torch.eye(4), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("across", "down", "corner"), [(0.05, 0.05, False), (0.12, 0.12, True), (0.08, 0.0, False)])
+def test_parts_of_one_picture_give_no_sure_camera(
+    scene: scenes.Scene, across: float, down: float, corner: bool
+) -> None:
+    """Zoomed, cropped at a corner, stretched: matches agree as well as they can, and there is no depth in them."""
+    parts = []
+    for k in range(3):
+        cut = round(WIDTH * k * across), round(HEIGHT * k * down)
+        left, top = (0, 0) if corner else (cut[0] // 2, cut[1] // 2)
+        part = scene.images[:1, :, top : top + HEIGHT - cut[1], left : left + WIDTH - cut[0]]
+        parts.append(torch.nn.functional.interpolate(part, (HEIGHT, WIDTH), mode="bicubic", antialias=True).clamp(0, 1))
+    found = estimate_cameras(torch.cat(parts), FASTEST, generator=generator())
+    assert not any(view.registered and not view.loose for view in found.report.views)
+    assert any("no depth" in view.reason for view in found.report.views)
+
+
+def test_photos_of_a_room_are_sure(reconstruction: SparseReconstruction) -> None:
+    assert all(view.registered and not view.loose for view in reconstruction.report.views)
+    assert PairKind.FLAT not in {pair.kind for pair in reconstruction.report.pairs}
+
+
+def test_a_shape_that_panoramas_have_keeps_a_camera_from_being_sure(scene: scenes.Scene) -> None:
+    optics = [
+        replace(ViewOptics.of_whole_image(HEIGHT, WIDTH), doubt="it may be a panorama" if k == 2 else "")
+        for k in range(4)
+    ]
+    found = estimate_cameras(scene.images, FASTEST, generator=generator(), optics=optics)
+    assert [view.loose for view in found.report.views] == [False, False, True, False]
+    assert found.report.views[2].reason == "it may be a panorama"
 
 
 def test_noise_images_are_unrelated() -> None:

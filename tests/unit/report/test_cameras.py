@@ -97,7 +97,7 @@ def test_a_model_without_cameras_says_nothing(tmp_path: Path) -> None:
 def test_the_console_gets_a_line_per_set_of_views(outputs: Path) -> None:
     assert camera_lines(outputs) == [
         "room: 1 of 2 photos used: b <1>.jpg left out (its matches agree with no camera)",
-        "room, round 1: 2 of 3 views used: b <1>.jpg left out (its matches agree with no camera)",
+        "room, round 1: 2 of 3 views used, 1 of them roughly: b <1>.jpg left out (its matches agree with no camera)",
     ]
 
 
@@ -150,3 +150,13 @@ def test_means_say_how_many_views_they_are_over_and_lost_views_stand_apart(
     assert "<h4>v1.jpg" not in placed
     assert "<h4>v1.jpg" in lost
     assert "no camera (35.50 dB at a placeholder)" in lost
+
+
+def test_views_that_are_rough_for_one_reason_are_counted_and_share_a_line() -> None:
+    rough = tuple(
+        replace(FINE, view_id=f"v{k}", name=f"{k}.jpg", rough=True, reason="there is no depth") for k in range(3)
+    )
+    report = CameraReport(views=rough, notes=())
+    assert report.summary() == "3 of 3 photos used, all of them roughly"
+    assert report.remarks() == ("0.jpg, 1.jpg, 2.jpg: roughly placed, there is no depth",)
+    assert CameraReport(views=(FINE, *rough), notes=()).summary() == "4 of 4 photos used, 3 of them roughly"
