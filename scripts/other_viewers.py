@@ -6,7 +6,8 @@ RECONSTRUCTION and VIEWS are folders of a run (``.../captured/reconstruction`` a
 drawn at one captured view's camera at multiples of the stored size by
 
 - gsplat's own torch reference (``pip install --no-deps gsplat==1.5.3``), and
-- two WebGL viewers in a headless Chromium (``npm install @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 three@0.180.0``),
+- two WebGL viewers in a headless Chromium (``npm install @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 three@0.180.0``)
+  on Mesa's software renderer (``apt-get install libegl1 libgl1-mesa-dri``),
 
 each with opacities compensated for its blur on the screen, as the scene is meant, and without. Every picture is compared with the photo
 brought to its size, and with our own render. The viewers read the files by themselves; gsplat is given what our reader finds in them.
@@ -21,6 +22,7 @@ import http.server
 import importlib.util
 import io
 import json
+import os
 import shutil
 import tempfile
 import threading
@@ -58,15 +60,19 @@ Picture = Float[Tensor, "3 height width"]
 _BLUR = 0.3  # pixels^2, what all of these programs add to the covariance on the screen
 _SETTLE_S = 3.0  # viewers sort beside the drawing: a picture counts when the next one, so much later, is the same
 _PATIENCE_S = 580.0  # for one frame, drawn without a graphics card
+# Mesa's llvmpipe: Chromium's own software renderer takes minutes for a frame of so many instances.
+_GRAPHICS = ("--use-gl=angle", "--use-angle=gl-egl")
 _HEAD = """<!doctype html><style>body{margin:0;background:#000}canvas{display:block}</style><script type="importmap">{"imports":{
-"three":"/node_modules/three/build/three.module.js",
+"three":"/node_modules/three/build/three.module.js","three/addons/":"/node_modules/three/examples/jsm/",
 "mkkellogg":"/node_modules/@mkkellogg/gaussian-splats-3d/build/gaussian-splats-3d.module.js",
-"spark":"/node_modules/@sparkjsdev/spark/dist/spark.module.js"}}</script><script type="module">
-import * as THREE from "three";
-const ask = new URLSearchParams(location.search), compensated = ask.get("compensated") === "1";
+"spark":"/node_modules/@sparkjsdev/spark/dist/spark.module.js",
+"fflate":"/node_modules/fflate/esm/browser.js"}}</script><script>
 const say = (state) => { document.documentElement.dataset.state = state; };
 window.onerror = (message) => say("failed: " + message);
 window.onunhandledrejection = (event) => say("failed: " + (event.reason && event.reason.stack || event.reason));
+</script><script type="module">
+import * as THREE from "three";
+const ask = new URLSearchParams(location.search), compensated = ask.get("compensated") === "1";
 const c = JSON.parse(ask.get("camera")), w = innerWidth, h = innerHeight;
 const fullW = 2 * Math.max(c.cx, w - c.cx), fullH = 2 * Math.max(c.cy, h - c.cy);
 const camera = new THREE.PerspectiveCamera(2 * Math.atan(fullH / 2 / c.fy) * 180 / Math.PI, fullW / c.fx / (fullH / c.fy), 0.01, 500);
@@ -150,9 +156,11 @@ class Scene:
         image, alpha, _ = gsplat_reference.draw_gsplat(frame, frame.leaves(), None, antialiased=compensated)
         return image.permute(2, 0, 1).clamp(0, 1), float((alpha < OPEN_ALPHA).double().mean())
 
-    def camera(self, times: int) -> dict[str, float | list[float]]:
-        """For the viewers' pages."""
+    def camera(self, times: int, file: str) -> dict[str, float | list[float]]:
+        """For the viewers' pages, in the axes of the file: the format SPZ has y up and z backwards."""
         pose, k = self.world_from_cam.double(), self.lens(times).double()
+        if file.endswith("spz"):
+            pose = torch.diag(torch.tensor([1, -1, -1, 1]).double()) @ pose
         eye, right_down_forward = pose[:3, 3], pose[:3, :3]
         return {
             "fx": float(k[0, 0]), "fy": float(k[1, 1]), "cx": float(k[0, 2]), "cy": float(k[1, 2]),
@@ -219,16 +227,21 @@ def compare(scene: Scene, modules: Path, times: list[int], pictures: Path | None
             for compensated in (True, False):
                 picture, through = scene.gsplat(gaussians, n, compensated=compensated)
                 report("gsplat", file, compensated, n, picture, f"open {100 * through:.1f} %")
+    os.environ.setdefault("EGL_PLATFORM", "surfaceless")  # Mesa's, where there is no screen
     (scene.folder / "node_modules").symlink_to(modules.resolve(), target_is_directory=True)
     for name, script in VIEWERS.items():
         (scene.folder / f"{name}.html").write_text(_HEAD + script, encoding="utf-8")
-    with served(scene.folder) as address, browser_page(scene.folder / "profile", _PATIENCE_S) as tab:
+    with served(scene.folder) as address, browser_page(scene.folder / "profile", _PATIENCE_S, _GRAPHICS) as tab:
         for name in VIEWERS:
             for file in files if name in READS_SPZ else ("scene.ply",):
                 for compensated in (True, False):
                     for n in times:
                         height, width = scene.size(n)
-                        facts = {"camera": json.dumps(scene.camera(n)), "file": file, "compensated": int(compensated)}
+                        facts = {
+                            "camera": json.dumps(scene.camera(n, file)),
+                            "file": file,
+                            "compensated": int(compensated),
+                        }
                         shown = drawn_by(tab, f"{address}/{name}.html?{urlencode(facts)}", width, height)
                         report(name, file, compensated, n, shown)
 

@@ -12,7 +12,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -106,11 +106,17 @@ class Page:
 
 
 @contextlib.contextmanager
-def browser_page(profile: Path, patience_s: float = 120) -> Iterator[Page]:
-    """A tab of a fresh browser; ``profile`` is a folder of its own, ``patience_s`` the longest wait for one answer."""
+def browser_page(profile: Path, patience_s: float = 120, flags: Sequence[str] = ()) -> Iterator[Page]:
+    """A tab of a fresh browser.
+
+    Args:
+        profile: a folder of its own.
+        patience_s: the longest wait for one answer.
+        flags: further ones; of those that are given twice the later counts.
+    """
     from websockets.sync.client import connect
 
-    command = [find_browser(), *_FLAGS, f"--user-data-dir={profile}", "about:blank"]
+    command = [find_browser(), *_FLAGS, *flags, f"--user-data-dir={profile}", "about:blank"]
     with (profile.parent / "browser.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
     try:
