@@ -47,6 +47,7 @@ from sceneexpander.errors import entry_point
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.sizes import OPEN_ALPHA
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.splatting import render
@@ -133,8 +134,8 @@ class Scene:
     @torch.no_grad()
     def ours(self, gaussians: Gaussians, times: int) -> Picture:
         """Our own render."""
-        pose, lens = self.world_from_cam[None], self.lens(times)[None]
-        return render(gaussians, pose, lens, *self.size(times)).rgb[0].clamp(0, 1)
+        camera = Cameras(self.world_from_cam[None], self.lens(times)[None], *self.size(times))
+        return render(gaussians, camera).rgb[0].clamp(0, 1)
 
     @torch.no_grad()
     def gsplat(self, gaussians: Gaussians, times: int, *, compensated: bool) -> tuple[Picture, float]:

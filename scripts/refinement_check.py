@@ -24,10 +24,11 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.sizes import at_sizes
 from sceneexpander.expansion import initial_state
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.ingest import load_scene
 from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.refine import refine
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 
@@ -48,7 +49,10 @@ def shown(views: ViewSet, view: int, *scenes: Reconstruction) -> tuple[float, li
     """
     one = slice(view, view + 1)
     seen = [
-        render(scene.gaussians, scene.world_from_cam[one], scene.intrinsics_px[one], views.height, views.width)
+        render(
+            scene.gaussians,
+            Cameras(scene.world_from_cam[one], scene.intrinsics_px[one], views.height, views.width),
+        )
         for scene in scenes
     ]
     covered = torch.stack([found.alpha[0] > COVERED for found in seen]).all(0)

@@ -6,11 +6,25 @@ from dataclasses import replace
 
 import torch
 
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.evaluation.image import psnr
+from sceneexpander.geometry.cameras import Cameras
+from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.exposure import Exposures
 from sceneexpander.photometric.refine import refine
-from tests.unit.photometric.test_refine import CONFIG, IMAGES, shown, spoiled
+from sceneexpander.splatting import render
+from tests.worlds.spoiled import TRUTH, VIEWS, spoiled
 
+CONFIG = RefineConfig(visits=20, colours=0.1)  # fast colours: the start is grey
+IMAGES = VIEWS.images
 GAIN = torch.tensor([1.2, 1 / 1.2, 1.0])[:, None, None, None]  # of two photos; the third picture is generated
+
+
+def shown(reconstruction: Reconstruction, view: int) -> float:
+    """PSNR of one view's picture."""
+    one = slice(view, view + 1)
+    camera = Cameras(TRUTH.world_from_cam[one], TRUTH.intrinsics_px[one], *IMAGES.shape[2:])
+    return psnr(render(reconstruction.gaussians, camera).rgb[0], IMAGES[view])
 
 
 def test_photos_of_other_exposures_teach_the_scene_of_the_middle_one() -> None:
