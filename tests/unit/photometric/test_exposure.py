@@ -15,7 +15,7 @@ from sceneexpander.photometric.refine import refine
 from sceneexpander.splatting import render
 from tests.worlds.spoiled import TRUTH, VIEWS, spoiled
 
-CONFIG = RefineConfig(visits=20, colours=0.1)  # fast colours: the start is grey
+CONFIG = RefineConfig(visits=10, colours=0.1)  # fast colours: the start is grey
 IMAGES = VIEWS.images
 GAIN = torch.tensor([1.2, 1 / 1.2, 1.0])[:, None, None, None]  # of two photos; the third picture is generated
 
