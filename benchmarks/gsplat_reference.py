@@ -94,38 +94,57 @@ def pixel_lists(
     return torch.cat(gaussians), torch.cat(pixels)
 
 
-def run_gsplat(
-    scene: Scene, lists: tuple[Tensor, Tensor] | None
-) -> Callable[[], tuple[Tensor, list[Tensor], tuple[Tensor, Tensor]]]:
-    """A function that renders and returns (image, leaves, index lists); given lists are not recomputed."""
+def draw_gsplat(
+    scene: Scene, leaves: list[Tensor], lists: tuple[Tensor, Tensor] | None, *, antialiased: bool
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+    """(image, alpha, index lists), height and width first; given lists are not recomputed.
+
+    ``antialiased`` compensates opacities for the blur on the screen, as gsplat's mode of that name does.
+    """
     install_nerfacc_stand_in()
     from gsplat.cuda import _torch_impl as reference
 
+    means, quats, scales, opacities, colours = leaves
     tiles_x, tiles_y = (scene.width + TILE - 1) // TILE, (scene.height + TILE - 1) // TILE
+    covars, _ = reference._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    radii, means2d, depths, conics, kept = reference._fully_fused_projection(
+        means,
+        covars,
+        scene.viewmat[None],
+        scene.intrinsics[None],
+        scene.width,
+        scene.height,
+        calc_compensations=antialiased,
+    )
+    if antialiased:
+        opacities = opacities * kept[0]
+    if lists is None:
+        keys, flat = tile_lists(means2d[0], radii[0], depths[0], tiles_x, tiles_y)
+        offsets = reference._isect_offset_encode(keys, 1, tiles_x, tiles_y)
+        lists = pixel_lists(scene, means2d[0], conics[0], opacities, offsets, flat)
+    gaussian, pixel = lists
+    image, alpha = reference.accumulate(
+        means2d,
+        conics,
+        opacities[None],
+        colours[None],
+        gaussian,
+        pixel,
+        torch.zeros_like(gaussian),
+        scene.width,
+        scene.height,
+    )
+    return image[0], alpha[0, ..., 0], lists
+
+
+def run_gsplat(
+    scene: Scene, lists: tuple[Tensor, Tensor] | None, *, antialiased: bool
+) -> Callable[[], tuple[Tensor, list[Tensor], tuple[Tensor, Tensor]]]:
+    """A function that renders and returns (image, leaves, index lists), see `draw_gsplat`."""
 
     def forward() -> tuple[Tensor, list[Tensor], tuple[Tensor, Tensor]]:
-        leaves = means, quats, scales, opacities, colours = scene.leaves()
-        covars, _ = reference._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-        radii, means2d, depths, conics, _ = reference._fully_fused_projection(
-            means, covars, scene.viewmat[None], scene.intrinsics[None], scene.width, scene.height
-        )
-        held = lists
-        if held is None:
-            keys, flat = tile_lists(means2d[0], radii[0], depths[0], tiles_x, tiles_y)
-            offsets = reference._isect_offset_encode(keys, 1, tiles_x, tiles_y)
-            held = pixel_lists(scene, means2d[0], conics[0], opacities, offsets, flat)
-        gaussian, pixel = held
-        image, _ = reference.accumulate(
-            means2d,
-            conics,
-            opacities[None],
-            colours[None],
-            gaussian,
-            pixel,
-            torch.zeros_like(gaussian),
-            scene.width,
-            scene.height,
-        )
-        return image[0], list(leaves), held
+        leaves = scene.leaves()
+        image, _, held = draw_gsplat(scene, leaves, lists, antialiased=antialiased)
+        return image, leaves, held
 
     return forward

@@ -1,6 +1,6 @@
 """Speed of the CPU rasteriser as ratios to gsplat's own torch reference, in one process on one thread.
 
-    python benchmarks/rasteriser.py [--scene S|M] [--repeats 5] [--json FILE]     (M: about two minutes)
+    python benchmarks/rasteriser.py [--scene S|M] [--antialiased] [--repeats 5] [--json FILE]     (M: about two minutes)
 
 Every compiled build that this CPU can run is measured (AVX2, AVX-512). The scene is that of a feed-forward reconstruction: one
 Gaussian per pixel of two source views of a wall with relief behind a disc, seen from a third camera; RGB, squared-error loss.
@@ -38,9 +38,11 @@ AIM = (100.0, 60.0, 30.0)
 LEVELS = {"v3": "AVX2", "v4": "AVX-512", "plain": "plain"}
 
 
-def run_ours(scene: Scene, backend: str, threads: int) -> Callable[[], tuple[Tensor, list[Tensor]]]:
+def run_ours(
+    scene: Scene, backend: str, threads: int, *, antialiased: bool
+) -> Callable[[], tuple[Tensor, list[Tensor]]]:
     """A function that renders and returns (image, leaves)."""
-    settings = RasterSettings(max_alpha=0.999, backend=backend, threads=threads)  # type: ignore[arg-type]
+    settings = RasterSettings(max_alpha=0.999, backend=backend, threads=threads, antialiased=antialiased)  # type: ignore[arg-type]
 
     def forward() -> tuple[Tensor, list[Tensor]]:
         leaves = scene.leaves()
@@ -97,7 +99,7 @@ def usable_builds() -> dict[str, str]:
     return {build: LEVELS[build] for build in known if kernel_backend.open_build(build) is not None}
 
 
-def measure_kernels(scene: Scene, repeats: int) -> dict[str, Timing]:
+def measure_kernels(scene: Scene, repeats: int, *, antialiased: bool) -> dict[str, Timing]:
     """Every usable build on one thread, the one that would be chosen also on two."""
     timings: dict[str, Timing] = {}
     for build, level in usable_builds().items():
@@ -105,7 +107,9 @@ def measure_kernels(scene: Scene, repeats: int) -> dict[str, Timing]:
         kernel_backend.load_kernel = lambda kernel=kernel: kernel  # type: ignore[assignment]
         for threads in (1, 2) if not timings else (1,):
             name = f"kernel {level}, {threads} thread{'s'[: threads - 1]}"
-            timings[name] = report(name, measure(scene, run_ours(scene, "cpu", threads), repeats))
+            timings[name] = report(
+                name, measure(scene, run_ours(scene, "cpu", threads, antialiased=antialiased), repeats)
+            )
     chosen = kernel_backend.open_build(next(iter(usable_builds())))
     kernel_backend.load_kernel = lambda: chosen  # type: ignore[assignment]
     return timings
@@ -117,9 +121,9 @@ def report(name: str, timing: Timing) -> Timing:
     return timing
 
 
-def compare_pictures(scene: Scene, theirs: Tensor) -> None:
+def compare_pictures(scene: Scene, theirs: Tensor, *, antialiased: bool) -> None:
     """How far apart the pictures are: nearly all pixels agree to rounding, some pairs of nearly equal depth change places."""
-    difference = (run_ours(scene, "cpu", 1)()[0] - theirs).detach().abs().flatten()
+    difference = (run_ours(scene, "cpu", 1, antialiased=antialiased)()[0] - theirs).detach().abs().flatten()
     psnr = -10 * math.log10(float((difference**2).mean()))
     print(f"kernel against gsplat: {psnr:.1f} dB, median difference {float(difference.median()):.1e}", flush=True)
 
@@ -148,6 +152,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", choices=sorted(SCENES), default="M")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--antialiased", action="store_true", help="opacities compensated for the blur, by all of them")
     parser.add_argument("--skip-reference", action="store_true", help="time our own backends only")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -155,20 +160,21 @@ def main() -> None:
     scene = make_scene(args.scene)
     assert usable_builds(), "no compiled kernel: install the package with a C++ compiler"
     print(f"scene {args.scene}: {len(scene.means)} Gaussians, {scene.width}x{scene.height}", flush=True)
-    timings = measure_kernels(scene, max(args.repeats, 7))
+    timings = measure_kernels(scene, max(args.repeats, 7), antialiased=args.antialiased)
     one, two = (timings[f"kernel {next(iter(usable_builds().values()))}, {n}"] for n in ("1 thread", "2 threads"))
     ratios: dict[str, float] = {}
     pairs = 0
     if not args.skip_reference:
-        fallback = measure(scene, run_ours(scene, "torch", 1), max(2, args.repeats // 2))
+        fallback = measure(scene, run_ours(scene, "torch", 1, antialiased=args.antialiased), max(2, args.repeats // 2))
         timings["torch fallback"] = report("torch fallback", fallback)
-        ref_image, _, lists = run_gsplat(scene, None)()
+        ref_image, _, lists = run_gsplat(scene, None, antialiased=args.antialiased)()
         pairs = len(lists[0])
         print(f"{pairs / (scene.width * scene.height):.1f} contributing pairs per pixel")
-        compare_pictures(scene, ref_image)
+        compare_pictures(scene, ref_image, antialiased=args.antialiased)
         del ref_image
         for name, given in (("gsplat ref", None), ("gsplat core", lists)):
-            timings[name] = report(name, measure(scene, run_gsplat(scene, given), args.repeats, warm_up=0))
+            theirs = run_gsplat(scene, given, antialiased=args.antialiased)
+            timings[name] = report(name, measure(scene, theirs, args.repeats, warm_up=0))
         ratios = ratios_of(timings, args.scene)
     ratios["2 threads vs 1, forward, wall"] = one.forward_wall / two.forward_wall
     ratios["2 threads vs 1, forward+backward, wall"] = one.both_wall / two.both_wall
@@ -177,6 +183,7 @@ def main() -> None:
     if args.json:
         result = {
             "scene": args.scene,
+            "antialiased": args.antialiased,
             "gaussians": len(scene.means),
             "pairs_per_pixel": pairs / (scene.width * scene.height),
             "repeats": args.repeats,

@@ -1,8 +1,9 @@
 """What the fit of the Gaussians does to photos it sees and to one it does not: python scripts/refinement_check.py FOLDER ...
 
 A folder is as in ``scenes/``. Each photo in turn is held out: its own Gaussians are removed, the others are fitted to the other photos, and
-what they show at the held-out camera is compared with the held-out photo where they cover it. Cameras and depth are those of all
-photos, so this measures the fit alone.
+what they show at the held-out camera is compared with the held-out photo, over the pixels that are covered before the fit and after it:
+the fit closes surfaces, and what it covers in addition is not what was easy to show. Cameras and depth are those of all photos, so this
+measures the fit alone.
 """
 
 from __future__ import annotations
@@ -41,12 +42,22 @@ def at_photo_size(reconstruction: Reconstruction, views: ViewSet, posed: list[in
     return sum(size.psnr_db or 0.0 for size in found) / len(found), sum(size.open_share for size in found) / len(found)
 
 
-def shown(reconstruction: Reconstruction, views: ViewSet, view: int) -> float:
-    """PSNR of one photo at the stored size over the pixels that are covered."""
+def shown(views: ViewSet, view: int, *scenes: Reconstruction) -> tuple[float, list[float]]:
+    """The share of a photo's pixels that every scene covers, and each scene's PSNR over them, at the stored size.
+
+    Colours are divided by alpha: what is compared is what is there, not the black behind it.
+    """
     one = slice(view, view + 1)
-    cameras = reconstruction.world_from_cam[one], reconstruction.intrinsics_px[one]
-    seen = render(reconstruction.gaussians, Cameras(*cameras, views.height, views.width))
-    return psnr(seen.rgb[0], views.images[view], seen.alpha[0] > COVERED)
+    seen = [
+        render(
+            scene.gaussians,
+            Cameras(scene.world_from_cam[one], scene.intrinsics_px[one], views.height, views.width),
+        )
+        for scene in scenes
+    ]
+    covered = torch.stack([found.alpha[0] > COVERED for found in seen]).all(0)
+    colours = [found.rgb[0] / found.alpha[0].clamp(min=COVERED) for found in seen]
+    return float(covered.double().mean()), [psnr(colour, views.images[view], covered) for colour in colours]
 
 
 def check(folder: Path, overrides: list[str]) -> None:
@@ -58,28 +69,31 @@ def check(folder: Path, overrides: list[str]) -> None:
     views, settings = state.views, config.refine
     posed = start.posed.nonzero()[:, 0].tolist()
     result, _ = refine(start, views.images, settings, photos=views.photos, seed=config.seed)
-    before, after = (sum(shown(r, views, v) for v in posed) / len(posed) for r in (start, result))
+    before, after = (
+        sum(found) / len(posed) for found in zip(*(shown(views, v, start, result)[1] for v in posed), strict=True)
+    )
     print(f"{scene.name}: {len(posed)} photos, {len(start.gaussians)} Gaussians, fitted {before:.2f} -> {after:.2f} dB")
     for name, reconstruction in (("before", start), ("after", result)):
         own, open_share = at_photo_size(reconstruction, views, posed)
         print(f"  {name}, in the photos' own pixels: {own:.2f} dB, {100 * open_share:.1f} % open")
     changes = []
     for view in posed:
-        before, after = held_out(start, views, view, settings, seed=config.seed)
+        share, (before, after) = held_out(start, views, view, settings, seed=config.seed)
         changes.append(after - before)
-        print(f"  without {views.records[view].name}: {before:.2f} -> {after:.2f} dB", flush=True)
+        name = views.records[view].name
+        print(f"  without {name}: {before:.2f} -> {after:.2f} dB on {100 * share:.0f} % of it", flush=True)
     print(f"  held out, mean: {sum(changes) / len(changes):+.2f} dB", flush=True)
 
 
 def held_out(
     start: Reconstruction, views: ViewSet, view: int, config: RefineConfig, *, seed: int
-) -> tuple[float, float]:
-    """PSNR of a photo that took no part, before and after."""
+) -> tuple[float, list[float]]:
+    """What is shown of a photo that took no part, see `shown`: before the fit and after it."""
     without = replace(start, gaussians=start.gaussians.select(start.gaussians.source_view != view))
     weights = torch.ones_like(start.depth)
     weights[view] = 0
     fitted, _ = refine(without, views.images, config, photos=views.photos, weights=weights, seed=seed)
-    return shown(without, views, view), shown(fitted, views, view)
+    return shown(views, view, without, fitted)
 
 
 @entry_point

@@ -12,7 +12,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -29,6 +29,7 @@ _FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
+    "--disable-gpu-watchdog",  # software rendering on a busy machine is slow, not stuck
     "--hide-scrollbars",
     "--force-device-scale-factor=1",
     "--no-first-run",
@@ -49,8 +50,8 @@ def find_browser() -> str:
 class Page:
     """One tab."""
 
-    def __init__(self, socket: Any) -> None:
-        self._socket = socket
+    def __init__(self, socket: Any, patience_s: float) -> None:
+        self._socket, self._patience_s = socket, patience_s
         self._last = 0
         self.requested: list[str] = []
         self.messages: list[str] = []
@@ -62,7 +63,7 @@ class Page:
         self._last += 1
         self._socket.send(json.dumps({"id": self._last, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=120))
+            answer = json.loads(self._socket.recv(timeout=self._patience_s))
             if answer.get("id") == self._last:
                 assert "error" not in answer, answer
                 return dict(answer["result"])
@@ -105,11 +106,17 @@ class Page:
 
 
 @contextlib.contextmanager
-def browser_page(profile: Path) -> Iterator[Page]:
-    """A tab of a fresh browser; ``profile`` is a folder of its own."""
+def browser_page(profile: Path, patience_s: float = 120, flags: Sequence[str] = ()) -> Iterator[Page]:
+    """A tab of a fresh browser.
+
+    Args:
+        profile: a folder of its own.
+        patience_s: the longest wait for one answer.
+        flags: further ones; of those that are given twice the later counts.
+    """
     from websockets.sync.client import connect
 
-    command = [find_browser(), *_FLAGS, f"--user-data-dir={profile}", "about:blank"]
+    command = [find_browser(), *_FLAGS, *flags, f"--user-data-dir={profile}", "about:blank"]
     with (profile.parent / "browser.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
     try:
@@ -118,7 +125,7 @@ def browser_page(profile: Path) -> Iterator[Page]:
             tabs = [tab for tab in json.load(answer) if tab["type"] == "page"]
         # No pings: a browser that renders on a busy CPU may be late to answer, and is not gone.
         with connect(tabs[0]["webSocketDebuggerUrl"], max_size=None, proxy=None, ping_interval=None) as socket:
-            yield Page(socket)
+            yield Page(socket, patience_s)
     finally:
         # Its own session: the whole family of processes goes, and nobody else's.
         with contextlib.suppress(ProcessLookupError):

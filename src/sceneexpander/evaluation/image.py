@@ -61,8 +61,9 @@ def similarity(
     """
     if min(a.shape[1:]) < WINDOW:
         raise ValueError(f"ssim needs at least {WINDOW} x {WINDOW} pixels, got {tuple(a.shape[1:])}")
-    planes = torch.cat([a, b, a * a, b * b, a * b])
-    mean_a, mean_b, square_a, square_b, product = _windowed(planes).chunk(5)
+    # Two calls: a reference that needs no gradient shall not cost one.
+    mean_a, square_a, product = _windowed(torch.cat([a, a * a, a * b])).chunk(3)
+    mean_b, square_b = _windowed(torch.cat([b, b * b])).chunk(2)
     variance_a, variance_b = square_a - mean_a**2, square_b - mean_b**2
     covariance = product - mean_a * mean_b
     c1, c2 = K1**2, K2**2
@@ -97,31 +98,43 @@ def _windowed(planes: Float[Tensor, "plane height width"]) -> Float[Tensor, "pla
 
 
 class _Separable(torch.autograd.Function):
-    """Weighted sums over windows along both axes. Sums of shifted images: many times faster on a CPU than convolutions of one channel."""
+    """Weighted sums over windows along both axes. Sums of shifted images: many times faster on a CPU than convolutions of one channel.
+
+    One plane after the other: one stays in the processor's cache through all shifts, all together do not.
+    """
 
     @staticmethod
     def forward(ctx: Any, planes: Tensor, weights: list[float]) -> Tensor:
         ctx.weights = weights
-        for axis in (-2, -1):
-            length = planes.shape[axis] - len(weights) + 1
-            total = planes.narrow(axis, 0, length) * weights[0]
-            for shift, weight in enumerate(weights[1:], 1):
-                total.add_(planes.narrow(axis, shift, length), alpha=weight)
-            planes = total
-        return planes
+        return torch.stack([_gathered(plane, weights) for plane in planes])
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        for axis in (-1, -2):
-            length = gradient.shape[axis]
-            shape = list(gradient.shape)
-            shape[axis] += len(ctx.weights) - 1
-            total = gradient.new_zeros(shape)
-            for shift, weight in enumerate(ctx.weights):
-                total.narrow(axis, shift, length).add_(gradient, alpha=weight)
-            gradient = total
-        return gradient, None
+        return torch.stack([_scattered(plane, ctx.weights) for plane in gradient]), None
+
+
+def _gathered(plane: Tensor, weights: list[float]) -> Tensor:
+    for axis in (0, 1):
+        length = plane.shape[axis] - len(weights) + 1
+        total = plane.narrow(axis, 0, length) * weights[0]
+        for shift, weight in enumerate(weights[1:], 1):
+            total.add_(plane.narrow(axis, shift, length), alpha=weight)
+        plane = total
+    return plane
+
+
+def _scattered(plane: Tensor, weights: list[float]) -> Tensor:
+    """The transpose of `_gathered`."""
+    for axis in (1, 0):
+        length = plane.shape[axis]
+        shape = list(plane.shape)
+        shape[axis] += len(weights) - 1
+        total = plane.new_zeros(shape)
+        for shift, weight in enumerate(weights):
+            total.narrow(axis, shift, length).add_(plane, alpha=weight)
+        plane = total
+    return plane
 
 
 def _checked(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:

@@ -45,8 +45,9 @@ class RefineConfig:
     rotations: Rate = 3e-3
     opacities: Rate = 0.3
     colours: Rate = 3e-2
+    exposures: Rate = 1e-2  # of each photo's gains and offsets; 0: photos are taken to be exposed alike
     ssim_weight: Share = 0.2  # of 1 - SSIM beside the mean absolute error
-    solid_weight: Weight = 0.1  # of the light that passes through what a picture shows
+    solid_weight: Weight = 0.2  # of the light that passes through what a picture shows
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -3,9 +3,9 @@
 Such a model makes every view's Gaussians by themselves. Each set shows its own picture, but where several share a pixel, their colours
 and opacities do not add up to any of the pictures. A few visits to every view settle most of that, at the captured cameras and between
 them (docs/refinement.md). The pictures are taken at several sizes, that of the photos included, before a background of another colour each
-time, and no Gaussian gets narrower than what its finest view resolves: so the scene holds at other distances, too. Cameras, depth and
-normals stay as the model made them, and no Gaussian comes or goes: longer optimisation with densification is
-`sceneexpander.optimisation.optimise`.
+time, and no Gaussian gets narrower than what its finest view resolves: so the scene holds at other distances, too. What photos differ in
+by their exposure is left to them (`Exposures`). Cameras, depth and normals stay as the model made them, and no Gaussian comes or goes:
+longer optimisation with densification is `sceneexpander.optimisation.optimise`.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from sceneexpander.optimisation.optimise import photometric_loss, scene_extent
 from sceneexpander.optimisation.pictures import Picture, Pictures
 from sceneexpander.optimisation.splats import Splats
 from sceneexpander.photometric.config import RefineConfig
+from sceneexpander.photometric.exposure import Exposures
 from sceneexpander.photometric.report import FitReport
 from sceneexpander.splatting import RasterSettings, rasterise
 
@@ -103,6 +104,9 @@ class _Fit:
         world_from_cam = start.world_from_cam.to(device)
         self._cam_from_world = rigid_inverse(world_from_cam)
         self._ssim_weight, self._solid = config.ssim_weight, config.solid_weight
+        # A generated picture is brought to the photos' colours before (`corrections.colour`), and is no measurement of an exposure.
+        photos = [view for view in targets if not bool(start.generated[view])]
+        self._exposures = Exposures(len(start.view_ids), photos, rate=config.exposures, device=device)
         rates = RatesConfig(
             means=config.means,
             scales=config.scales,
@@ -131,8 +135,9 @@ class _Fit:
         for name, optimiser in self.splats.optimisers.items():
             optimiser.param_groups[0]["lr"] = self._rates[name] * share
         loss = self._loss(view, picture, background)
-        loss.backward()  # type: ignore[no-untyped-call]
+        (loss + self._exposures.penalty()).backward()
         self.splats.step()
+        self._exposures.step(share)
         return float(loss.detach())
 
     @torch.no_grad()
@@ -161,6 +166,8 @@ class _Fit:
         if picture.weights is not None:
             through = through * picture.weights
         return (
-            photometric_loss(seen.rgb[0], picture.rgb, self._ssim_weight, picture.weights)
+            photometric_loss(
+                self._exposures.applied(seen.rgb[0], view), picture.rgb, self._ssim_weight, picture.weights
+            )
             + self._solid * through.mean()
         )
