@@ -1,7 +1,7 @@
 """Your own photos, one command: ``sceneexpander expand PHOTOS --prompt "..." --inserted PICTURE``.
 
-``PHOTOS`` is a folder of photos, a scene folder with a ``scene.yaml``, a video, a COLMAP model, a ``transforms.json``, or what else
-`sceneexpander.ingest.sources` reads. The picture beyond their boundary is your own (``--inserted``),
+``PHOTOS`` is a folder of photos, a scene folder with a ``scene.yaml``, a video, a COLMAP model, a ``transforms.json``, what else
+`sceneexpander.ingest.sources` reads, or a ZIP archive of any of these. The picture beyond their boundary is your own (``--inserted``),
 or made from the words (``--generator``). Runs in ``runs/NAME`` and prints where the report is. Methods and settings are those of the
 project's params.yaml; ``key=value`` adds to them. ``--continue NAME`` goes on from a finished run, see `sceneexpander.growing`.
 """
@@ -15,9 +15,9 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point, printable
 from sceneexpander.generation import Forecast, backend_of
 from sceneexpander.ingest import IngestConfig, make_round, read_picture, safe_name, scene_files
+from sceneexpander.ingest.archives import is_archive, unpack_archive
 from sceneexpander.ingest.sources import read_capture
 from sceneexpander.ingest.sources.posed import write_posed_photos
 from sceneexpander.pipeline.disk import remove_tree
@@ -47,6 +48,7 @@ from sceneexpander.selection import Selection, check_name, read_selection
 NO_PICTURE = "give one --inserted PICTURE for each round, or have them made: --generator reproject, openai, ..."
 SCENE_FILE = "scene.yaml"
 SOURCE_FILE = "source.json"  # in a run's folder: which photos it is of
+UNPACKED = ".unpacked"  # while a run is put together: what an archive holds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +84,7 @@ def make_parser() -> CommandParser:
         type=Path,
         metavar="PHOTOS",
         nargs="?",
-        help="folder of photos, scene folder with scene.yaml, video, COLMAP model, transforms.json",
+        help="folder of photos, scene folder with scene.yaml, video, COLMAP model, transforms.json, or one of these as ZIP",
     )
     parser.add_argument("--inserted", type=Path, action="append", default=[], help="picture to insert, one per round")
     parser.add_argument("--prompt", action="append", default=[], help="what to add, one per round")
@@ -352,17 +354,21 @@ def expand(request: Request, *, project: Path) -> Path | None:
         check_source(folder, request)
         with scratch_folder(folder) as scratch:
             scene = scratch / name
-            with _shown_as_given(scene, request):
-                stage_scene(request, name, scene, ingest=config.scene, recorded=recorded)
-                checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
+            with _shown_as({scratch / UNPACKED: request.photos}):
+                source = request
+                if is_archive(request.photos):
+                    source = replace(request, photos=unpack_archive(request.photos, scratch / UNPACKED))
+                with _shown_as(_originals(scene, source)):
+                    stage_scene(source, name, scene, ingest=config.scene, recorded=recorded)
+                    checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
             announce_forecasts(checked.forecasts, config.generator.backend, details=request.dry_run)
             if request.dry_run:
                 return None
             agree_to_requests(checked.forecasts, unattended=request.unattended)
             selection = Selection(scenes=(name,), rounds=checked.rounds, methods=base.methods, overrides=overrides)
             folder.mkdir(exist_ok=True)
-            source = json.dumps({"photos": os.fsdecode(_identity(request)), "name": name}, indent=1)
-            write_bytes_atomic(folder / SOURCE_FILE, f"{source}\n".encode())
+            identity = json.dumps({"photos": os.fsdecode(_identity(request)), "name": name}, indent=1)
+            write_bytes_atomic(folder / SOURCE_FILE, f"{identity}\n".encode())
             make_workspace(folder, selection, project=project, scenes={name: scene}, move_scenes=True)
         reproduce(folder, project=project, lock=lock)
     return folder / "outputs" / "report" / "index.html"
@@ -416,18 +422,23 @@ def choice_lines(folder: Path, name: str, rounds: int) -> list[str]:
     return lines
 
 
+def _originals(scene: Path, request: Request) -> dict[Path, Path]:
+    """What the files of a scene's copy were copied from."""
+    originals: dict[Path, Path] = {}
+    if not (request.photos / SCENE_FILE).is_file():
+        originals |= {scene / inserted_name(k, path): path for k, path in enumerate(request.inserted, start=1)}
+        originals[scene / "captured"] = request.photos
+    return {**originals, scene: request.photos}
+
+
 @contextmanager
-def _shown_as_given(scene: Path, request: Request) -> Iterator[None]:
-    """Errors about the copy of a scene name the file that it was copied from."""
+def _shown_as(originals: Mapping[Path, Path]) -> Iterator[None]:
+    """Errors about copies name the file that they are from; the first of ``originals`` are looked for first."""
     try:
         yield
     except UserError as error:
-        originals: dict[Path, Path] = {}
-        if not (request.photos / SCENE_FILE).is_file():
-            originals |= {scene / inserted_name(k, path): path for k, path in enumerate(request.inserted, start=1)}
-            originals[scene / "captured"] = request.photos
         where, problem = error.where or "", error.problem
-        for copy, original in {**originals, scene: request.photos}.items():
+        for copy, original in originals.items():
             where, problem = where.replace(str(copy), str(original)), problem.replace(str(copy), str(original))
         raise UserError(problem, where=where or None, fix=error.fix) from None
 
