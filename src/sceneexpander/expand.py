@@ -400,7 +400,7 @@ def agree_to_requests(forecasts: Sequence[Forecast], *, unattended: bool) -> Non
     if unattended or all(cost == 0 for cost in costs):
         return
     total = None if any(cost is None for cost in costs) else sum(cost or 0.0 for cost in costs)
-    what = f"{requests} request{'s' * (requests != 1)} to an image service, {_cost_words(total)}"
+    what = f"{requests} request{'s' * (requests != 1)} to paid services, {_cost_words(total)}"
     if not sys.stdin.isatty():
         raise UserError(f"would send {what}", where="expand", fix="add --yes to send them without asking")
     if input(f"{what}. Send? [y/N] ").strip().casefold() not in ("y", "yes"):

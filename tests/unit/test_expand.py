@@ -512,5 +512,5 @@ def test_what_costs_something_is_asked_for_first(
         with pytest.raises(UserError):
             command.agree_to_requests(forecasts, unattended=unattended)
     assert bool(asked) == (answer is not None)
-    assert all("3 requests to an image service, about 0.75 USD" in text for text in asked)
+    assert all("3 requests to paid services, about 0.75 USD" in text for text in asked)
     command.agree_to_requests([Forecast(prompt="free")], unattended=False)
