@@ -104,7 +104,22 @@ def seven_scenes(folder: Path) -> None:
         Image.fromarray(np.full(SIZE, 1000, np.uint16)).save(folder / f"frame-{k:06d}.depth.png")
 
 
-def metashape(folder: Path) -> None:
+def reality_capture(folder: Path) -> None:
+    pictures(folder, ["0.png", "1.png", "2.png"])
+    for k in range(3):
+        facts = 'xcr:DistortionModel="brown3" xcr:FocalLength35mm="30" xcr:PrincipalPointU="-0.01" xcr:PrincipalPointV="0.005"'
+        rotation, position = (
+            " ".join(map(repr, part.ravel().tolist())) for part in (pose(k)[:3, :3].T, pose(k)[:3, 3])
+        )
+        body = f"<xcr:Rotation>{rotation}</xcr:Rotation><xcr:Position>{position}</xcr:Position>"
+        body += "<xcr:DistortionCoeficients>0.1 -0.02 0.003 0 0 0</xcr:DistortionCoeficients>"
+        space = 'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"'
+        inner = f"<rdf:Description {space} {facts}>{body}</rdf:Description>"
+        rdf = f'<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">{inner}</rdf:RDF>'
+        (folder / f"{k}.xmp").write_text(f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{rdf}</x:xmpmeta>')
+
+
+def metashape(folder: Path, world: str = "") -> None:
     pictures(folder, ["0.png", "1.png", "2.png"])
     cameras = "".join(
         f'<camera id="{k}" sensor_id="0" label="{k}"><transform>{" ".join(map(repr, pose(k).ravel().tolist()))}</transform></camera>'
@@ -112,7 +127,7 @@ def metashape(folder: Path) -> None:
     )
     sensor = '<sensor id="0" type="frame"><resolution width="240" height="180"/>'
     sensor += '<calibration type="frame"><f>200</f><cx>-1</cx><cy>1</cy></calibration></sensor>'
-    body = f'<chunk label="c"><sensors>{sensor}</sensors><cameras>{cameras}</cameras></chunk>'
+    body = f'<chunk label="c"><sensors>{sensor}</sensors><cameras>{cameras}</cameras>{world}</chunk>'
     (folder / "cameras.xml").write_text(f'<?xml version="1.0"?><document version="2.0">{body}</document>')
 
 
@@ -143,6 +158,7 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "camera_params": camera_params,
     "seven_scenes": seven_scenes,
     "metashape": metashape,
+    "reality_capture": reality_capture,
 }
 
 
@@ -303,6 +319,103 @@ def test_masks_beside_pictures_are_not_used_pixels(tmp_path: Path) -> None:
     valid = load_photos(tmp_path, ROUNDS, CONFIG).views.validity()
     assert float(valid[0].float().mean()) == pytest.approx(0.5, abs=0.05)
     assert bool(valid[1].all())
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_the_transform_of_a_metashape_chunk_is_applied(tmp_path: Path, far: bool) -> None:
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    shift = np.array([4_000_000.0, 1, 2]) if far else np.array([5.0, 1, 2])
+    words = [" ".join(map(str, part.ravel().tolist())) for part in (turn, shift)]
+    inner = f'<rotation locked="false">{words[0]}</rotation><translation>{words[1]}</translation><scale>2.5</scale>'
+    metashape(tmp_path, f"<transform>{inner}</transform>")
+    capture = read_capture(tmp_path, CONFIG)
+    assert capture.metric
+    points = np.array([[0.1, 0.2, 1.0], [-0.4, 0.3, 2.0]])
+    for k, shot in enumerate(capture.shots):
+        assert shot.world_from_cam is not None
+        # Of a point of the chunk's frame, where the camera sees it must stay the same.
+        of_chunk = points @ pose(k)[:3, :3].T + pose(k)[:3, 3]
+        of_world = 2.5 * of_chunk @ turn.T + (0 if far else shift)
+        of_camera = (of_world - shot.world_from_cam[:3, 3]) @ shot.world_from_cam[:3, :3]
+        np.testing.assert_allclose(of_camera / 2.5, points, atol=1e-9)
+    assert any("placed on the Earth" in note for note in capture.notes) is far
+
+
+def test_the_lens_of_reality_capture_is_in_units_of_the_longer_side(tmp_path: Path) -> None:
+    reality_capture(tmp_path)
+    lens = read_capture(tmp_path, CONFIG).shots[0].lens
+    assert lens is not None
+    # The vendor's equations: distortion first, then the focal length, then pixels from the middle.
+    ray = np.array([0.3, -0.2])
+    square = float(ray @ ray)
+    bent = ray * (1 + 0.1 * square - 0.02 * square**2 + 0.003 * square**3)
+    expected = (30 / 36 * bent + [-0.01, 0.005]) * 240 + [120, 90]
+    np.testing.assert_allclose(lens.distorted((ray * lens.focal_px + lens.centre_px)[None])[0], expected, atol=1e-9)
+    path = tmp_path / "0.xmp"
+    path.write_text(path.read_text().replace("0.003 0 0 0", "0.003 0 0.1 0"))
+    with pytest.raises(UserError, match="model brown3 that is not read"):
+        read_capture(tmp_path, CONFIG)
+
+
+def test_an_xmp_file_of_a_photo_program_is_none_of_cameras(tmp_path: Path) -> None:
+    pictures(tmp_path, ["0.png", "1.png"])
+    (tmp_path / "0.xmp").write_text('<x:xmpmeta xmlns:x="adobe:ns:meta/"/>')
+    assert find_source(tmp_path) == "photos"
+
+
+def eth3d(folder: Path, *, undistorted: bool, depth: bool) -> np.ndarray:
+    """A scene as the data set has it: pictures and model in folders of their own, ground-truth depth as raw floats named ``.JPG``."""
+    kind = "dslr_images_undistorted" if undistorted else "dslr_images"
+    names = [f"{kind}/DSC_{k:04d}.JPG" for k in range(3)]
+    pictures(folder / "images", names)
+    camera = "PINHOLE 240 180 200 201 119 91"
+    if not undistorted:
+        camera = "THIN_PRISM_FISHEYE 240 180 200 201 119 91 0.05 -0.02 0.001 0.002 0.003 0.002 0.001 0.002"
+    lines = ["# Image list with two lines of data per image:"]
+    for k, name in enumerate(names):
+        cam = np.linalg.inv(pose(k))
+        numbers = " ".join(f"{value:.17g}" for value in (*quat_wxyz(cam[:3, :3]), *cam[:3, 3]))
+        lines += [f"{k + 1} {numbers} 0 {name}", "12.5 17.25 -1 100 90.5 7"]
+    model = folder / ("dslr_calibration_undistorted" if undistorted else "dslr_calibration_jpg")
+    model.mkdir(parents=True)
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    (model / "cameras.txt").write_text(f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n0 {camera}\n")
+    (model / "points3D.txt").write_text("# 3D point list\n")
+    values = np.full(SIZE, np.inf, np.float32)
+    values[::2] = np.linspace(1, 3, SIZE[1], dtype=np.float32)
+    if depth:
+        (folder / "ground_truth_depth" / "dslr_images").mkdir(parents=True)
+        for k in range(3):
+            path = folder / "ground_truth_depth" / "dslr_images" / f"DSC_{k:04d}.JPG"
+            path.write_bytes(values.astype("<f4").tobytes())
+    return values
+
+
+@pytest.mark.parametrize("undistorted", [True, False])
+def test_scenes_of_eth3d(tmp_path: Path, undistorted: bool) -> None:
+    values = eth3d(tmp_path, undistorted=undistorted, depth=True)
+    assert find_source(tmp_path) == "colmap"
+    capture = read_capture(tmp_path, CONFIG)
+    assert capture.metric
+    for k, shot in enumerate(capture.shots):
+        assert shot.world_from_cam is not None
+        assert shot.lens is not None
+        np.testing.assert_allclose(shot.world_from_cam, pose(k), atol=1e-9)
+        assert shot.lens.bends is not undistorted
+        assert (shot.depth is None) is undistorted, "depth belongs to the pictures as they were taken"
+        if shot.depth is not None:
+            np.testing.assert_array_equal(shot.depth.read(SIZE), np.where(np.isinf(values), 0, values))
+    assert any("belongs to the distorted pictures" in note for note in capture.notes) is undistorted
+    known = load_photos(tmp_path, ROUNDS, CONFIG).known
+    assert known is not None
+    assert known.metric
+    if not undistorted:
+        assert known.depth is not None
+        seen = known.depth[known.depth > 0]
+        assert len(seen) > 0.2 * known.depth.numel()
+        assert 1 <= float(seen.min()) < float(seen.max()) <= 3, "metres, and no infinity"
+    with pytest.raises(UserError, match="raw float32 depth map"):
+        load_photos(tmp_path / "ground_truth_depth" / "dslr_images", ROUNDS, CONFIG)
 
 
 @pytest.mark.parametrize("quarter_turn", [False, True])

@@ -16,6 +16,7 @@ from sceneexpander.ingest.sources.colmap import ColmapModel
 from sceneexpander.ingest.sources.metashape import MetashapeCameras
 from sceneexpander.ingest.sources.photos import PhotoFolder
 from sceneexpander.ingest.sources.posed import PosedPhotos
+from sceneexpander.ingest.sources.reality_capture import RealityCaptureXmp
 from sceneexpander.ingest.sources.transforms import Transforms
 from sceneexpander.ingest.sources.video import Video
 
@@ -29,6 +30,7 @@ SOURCES: dict[str, Source] = {
     "camera_texts": CameraTexts(),
     "camera_params": CameraParams(),
     "metashape": MetashapeCameras(),
+    "reality_capture": RealityCaptureXmp(),
     "video": Video(),
     "photos": PhotoFolder(),
 }
