@@ -1,8 +1,8 @@
 """Cameras that RealityCapture (RealityScan) writes beside its pictures: ``NAME.xmp`` for ``NAME.jpg``.
 
 Format: the vendor's "RealityCapture XMP Camera Math". ``Rotation`` is world-to-camera, row by row, OpenCV axes; ``Position`` is the
-camera's centre. The focal length is that of a 36 mm wide frame; focal length and principal point are in units of the longer side, the latter from
-the picture's middle; distortion is Brown's, before the focal length.
+camera's centre. The focal length is that of a frame 36 mm wide; focal length and principal point are in units of the longer side, the
+latter from the picture's middle; distortion is Brown's, before the focal length.
 """
 
 from __future__ import annotations
