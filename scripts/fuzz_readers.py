@@ -36,8 +36,8 @@ from sceneexpander.splatting.ply import read_ply, write_ply
 from sceneexpander.splatting.spz import read_spz, write_spz
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tests.unit.ingest.test_sources import MAKERS, eth3d
-from tests.unit.splatting.scenes import random_gaussians
+from tests.worlds.captures import MAKERS, eth3d
+from tests.worlds.random_gaussians import random_gaussians
 
 CONFIG = IngestConfig(long_side_px=112)
 WORDS = [

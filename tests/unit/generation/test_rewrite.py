@@ -17,8 +17,8 @@ from sceneexpander.errors import UserError
 from sceneexpander.generation import GenerationContext, SceneSoFar
 from sceneexpander.generation.service import ServiceGenerator
 from tests.unit.generation.loopback import Answer, Asked, Service, error, picture, said, serving
-from tests.unit.generation.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
-from tests.unit.generation.test_openai import KEY, generator, settings
+from tests.unit.generation.openai_service import KEY, generator, settings
+from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
 
 GIVEN = "You are exploring. Please generate a new viewpoint following the requirements: move right 30 %, a bench."
 SENT = "Step to the right by a third of the way and show a bench."

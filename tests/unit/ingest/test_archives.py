@@ -16,7 +16,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.ingest import archives
 from sceneexpander.ingest.archives import is_archive, unpack_archive
 from sceneexpander.ingest.sources import find_source, read_capture
-from tests.unit.ingest.test_sources import CONFIG, colmap, pictures, video
+from tests.worlds.captures import CONFIG, colmap, pictures, video
 
 pytestmark = pytest.mark.timeout(60)
 
