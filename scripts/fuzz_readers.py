@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import os
 import random
 import re
@@ -21,6 +22,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -121,23 +123,22 @@ def targets() -> Iterator[dict[str, Target]]:
         write_ply(scene, folder / "rgb.ply", rgb=True)
         write_spz(scene, folder / "3.spz")
         write_spz(scene, folder / "4.spz", version=4)
-        for title, file in (("ply", "a.ply"), ("ply-rgb", "rgb.ply")):
-            found[title] = Target(file=folder / file, read=lambda path=folder / file: read_ply(path))
-        for title, file in (("spz3", "3.spz"), ("spz4", "4.spz")):
-            found[title] = Target(file=folder / file, read=lambda path=folder / file: read_spz(path))
+        readers: dict[str, tuple[str, Callable[[Path], object]]] = {
+            "ply": ("a.ply", read_ply), "ply-rgb": ("rgb.ply", read_ply), "spz3": ("3.spz", read_spz), "spz4": ("4.spz", read_spz),
+        }  # fmt: skip
+        for title, (name_of_file, read) in readers.items():
+            found[title] = Target(file=folder / name_of_file, read=partial(read, folder / name_of_file))
         for kind, make in MAKERS.items():
             place = folder / kind
             place.mkdir()
             make(place)
             for file in read_capture(place, CONFIG, kind).files[:2]:
-                found[f"{kind}-{file.name}"] = Target(
-                    file=file, read=lambda place=place, kind=kind: read_capture(place, CONFIG, kind)
-                )
+                found[f"{kind}-{file.name}"] = Target(file=file, read=partial(read_capture, place, CONFIG, kind))
         binary = folder / "colmap_binary"
         if _write_binary_model(binary):
-            for file in ("cameras.bin", "images.bin"):
-                found[f"colmap-{file}"] = Target(
-                    file=binary / "sparse" / "0" / file, read=lambda: read_capture(binary, CONFIG, "colmap")
+            for part in ("cameras.bin", "images.bin"):
+                found[f"colmap-{part}"] = Target(
+                    file=binary / "sparse" / "0" / part, read=lambda: read_capture(binary, CONFIG, "colmap")
                 )
         (folder / "eth3d").mkdir()
         eth3d(folder / "eth3d", undistorted=False, depth=True)
@@ -151,7 +152,7 @@ def targets() -> Iterator[dict[str, Target]]:
         )
         for picture in pictures:
             found[f"picture{picture.suffix.lower()}"] = Target(
-                file=picture, read=lambda picture=picture: read_picture(picture, max_megapixels=MOST_MEGAPIXELS)
+                file=picture, read=partial(read_picture, picture, max_megapixels=MOST_MEGAPIXELS)
             )
         (folder / "scene" / "captured").mkdir(parents=True)
         yaml = folder / "scene" / "scene.yaml"
@@ -221,6 +222,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
+    logging.disable(logging.WARNING)
     failed = False
     with targets() as found:
         chosen = {name: target for name, target in found.items() if args.only is None or name in args.only}

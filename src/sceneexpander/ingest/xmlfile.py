@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Float
 from numpy import ndarray
@@ -26,8 +27,9 @@ def read_user_xml(path: Path) -> ElementTree.Element:
     data = read_plain_file(path, limit_bytes=_LIMIT_BYTES)
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise UserError("defines entities, which no file of cameras does", where=path)
-    parser = ElementTree.XMLPullParser(("start", "end"))
-    depth, root = 0, None
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
+    depth = 0
+    root: ElementTree.Element | None = None
     try:
         for start in range(0, len(data), _PIECE_BYTES):
             parser.feed(data[start : start + _PIECE_BYTES])

@@ -17,8 +17,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -162,7 +163,7 @@ class _Header:
     antialiased: bool  # as a comment says; without one they are not
 
 
-def _read_header(file: BinaryIO, path: Path) -> _Header:
+def _read_header(file: BufferedReader, path: Path) -> _Header:
     raw = file.read(MAX_HEADER_BYTES)
     if not raw.startswith((b"ply\n", b"ply\r")):
         raise UserError("is not a PLY file (does not start with 'ply')", where=path)
@@ -208,7 +209,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
     return _Header(encoding, elements[at][1], properties, skip, at == len(elements) - 1, antialiased)
 
 
-def _read_rows(file: BinaryIO, header: _Header, path: Path) -> Iterator[NDArray[np.void]]:
+def _read_rows(file: BufferedReader, header: _Header, path: Path) -> Iterator[NDArray[np.void]]:
     """The vertices as structured arrays, some thousands at a time; each is gone with the next."""
     missing = [name for name in (*FIXED, *ROTATION) if name not in dict(header.properties)]
     if missing and COMPRESSED & set(dict(header.properties)):
@@ -241,7 +242,7 @@ def _read_rows(file: BinaryIO, header: _Header, path: Path) -> Iterator[NDArray[
         yield rows
 
 
-def _read_ascii(file: BinaryIO, header: _Header, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
+def _read_ascii(file: BufferedReader, header: _Header, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
     lines = file.read().split(b"\n")[header.skip :]
     rows = [line for line in lines if line.strip()]
     if len(rows) < header.count or (header.is_last and len(rows) > header.count):
@@ -293,7 +294,7 @@ def _gather(chunks: Iterable[NDArray[np.void]], header: _Header, path: Path) -> 
         quat_wxyz=values["quat_wxyz"],
         scales=values["scales"],
         opacities=values["opacities"][:, 0],
-        sh=values["sh"].unflatten(1, (-1, 3)),
+        sh=values["sh"].reshape(at, 1 + rest // 3, 3),
         source_view=source_view,
         generated=generated,
         antialiased=header.antialiased,
@@ -365,9 +366,11 @@ def _gaussians(stored: Gaussians, header: _Header, path: Path, linear: frozenset
     for name in ("means", "quat_wxyz", "scales", "opacities", "sh"):
         value = getattr(scene, name)
         # A sum with NaN or inf in it is never finite; one that is not may have overflowed by itself.
-        bad = () if bool(torch.isfinite(value.sum())) else (~torch.isfinite(value)).nonzero()
+        if bool(torch.isfinite(value.sum())):
+            continue
+        bad = (~torch.isfinite(value)).nonzero()
         if len(bad):
-            raise UserError(f"vertex {int(bad[0][0])} has {name} that are not finite", where=path)
+            raise UserError(f"vertex {int(bad[0, 0])} has {name} that are not finite", where=path)
     flat = (scene.quat_wxyz == 0).all(-1)
     if bool(flat.any()):
         raise UserError(f"vertex {int(flat.nonzero()[0, 0])} has a zero rotation", where=path)
