@@ -1,7 +1,7 @@
 """Your own photos, one command: ``sceneexpander expand PHOTOS --prompt "..." --inserted PICTURE``.
 
-``PHOTOS`` is a folder of photos, a scene folder with a ``scene.yaml``, a video, a COLMAP model, a ``transforms.json``, or what else
-`sceneexpander.ingest.sources` reads. The picture beyond their boundary is your own (``--inserted``),
+``PHOTOS`` is a folder of photos, a scene folder with a ``scene.yaml``, a video, a COLMAP model, a ``transforms.json``, what else
+`sceneexpander.ingest.sources` reads, or a ZIP archive of any of these. The picture beyond their boundary is your own (``--inserted``),
 or made from the words (``--generator``). Runs in ``runs/NAME`` and prints where the report is. Methods and settings are those of the
 project's params.yaml; ``key=value`` adds to them. ``--continue NAME`` goes on from a finished run, see `sceneexpander.growing`.
 """
@@ -17,7 +17,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from sceneexpander.errors import UserError, entry_point, printable
 from sceneexpander.files import write_bytes_atomic
 from sceneexpander.generation import Forecast, backend_of
 from sceneexpander.ingest import IngestConfig, make_round, read_picture, safe_name, scene_files
+from sceneexpander.ingest.archives import is_archive, unpack_archive
 from sceneexpander.ingest.sources import read_capture
 from sceneexpander.ingest.sources.posed import write_posed_photos
 from sceneexpander.pipeline.disk import remove_tree
@@ -47,6 +48,7 @@ from sceneexpander.report.cameras import camera_lines
 NO_PICTURE = "give one --inserted PICTURE for each round, or have them made: --generator reproject, openai, ..."
 SCENE_FILE = "scene.yaml"
 SOURCE_FILE = "source.json"  # in a run's folder: which photos it is of
+UNPACKED = ".unpacked"  # while a run is put together: what an archive holds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +84,7 @@ def make_parser() -> CommandParser:
         type=Path,
         metavar="PHOTOS",
         nargs="?",
-        help="folder of photos, scene folder with scene.yaml, video, COLMAP model, transforms.json",
+        help="folder of photos, scene folder with scene.yaml, video, COLMAP model, transforms.json, or one of these as ZIP",
     )
     parser.add_argument("--inserted", type=Path, action="append", default=[], help="picture to insert, one per round")
     parser.add_argument("--prompt", action="append", default=[], help="what to add, one per round")
@@ -358,17 +360,21 @@ def expand(request: Request, *, project: Path) -> Path | None:
         check_source(folder, request)
         with scratch_folder(folder) as scratch:
             scene = scratch / name
-            with shown_as_given(_originals(scene, request)):
-                stage_scene(request, name, scene, ingest=config.scene, recorded=recorded)
-                checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
+            with shown_as_given({scratch / UNPACKED: request.photos}):
+                source = request
+                if is_archive(request.photos):
+                    source = replace(request, photos=unpack_archive(request.photos, scratch / UNPACKED))
+                with shown_as_given(_originals(scene, source)):
+                    stage_scene(source, name, scene, ingest=config.scene, recorded=recorded)
+                    checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
             announce_forecasts(checked.forecasts, config.generator.backend, details=request.dry_run)
             if request.dry_run:
                 return None
             agree_to_requests(checked.forecasts, unattended=request.unattended)
             selection = Selection(scenes=(name,), rounds=checked.rounds, methods=base.methods, overrides=overrides)
             folder.mkdir(exist_ok=True)
-            source = {"photos": os.fsdecode(_identity(request)), "name": name, "rounds": checked.rounds}
-            write_bytes_atomic(folder / SOURCE_FILE, f"{json.dumps(source, indent=1)}\n".encode())
+            facts = {"photos": os.fsdecode(_identity(request)), "name": name, "rounds": checked.rounds}
+            write_bytes_atomic(folder / SOURCE_FILE, f"{json.dumps(facts, indent=1)}\n".encode())
             make_workspace(folder, selection, project=project, scenes={name: scene}, move_scenes=True)
         reproduce(folder, project=project, lock=lock)
     return folder / "outputs" / "report" / "index.html"
@@ -400,7 +406,7 @@ def agree_to_requests(forecasts: Sequence[Forecast], *, unattended: bool) -> Non
     if unattended or all(cost == 0 for cost in costs):
         return
     total = None if any(cost is None for cost in costs) else sum(cost or 0.0 for cost in costs)
-    what = f"{requests} request{'s' * (requests != 1)} to an image service, {_cost_words(total)}"
+    what = f"{requests} request{'s' * (requests != 1)} to paid services, {_cost_words(total)}"
     if not sys.stdin.isatty():
         raise UserError(f"would send {what}", where="expand", fix="add --yes to send them without asking")
     if input(f"{what}. Send? [y/N] ").strip().casefold() not in ("y", "yes"):

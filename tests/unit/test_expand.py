@@ -55,6 +55,34 @@ def test_the_same_photos_go_on_and_others_are_refused(project: Path, tmp_path: P
     expand(request(second, tmp_path, name="second"), project=project)
 
 
+def test_a_packed_capture_is_a_run_of_what_it_holds(project: Path, tmp_path: Path) -> None:
+    photos(tmp_path / "terrace")
+    scene(tmp_path / "room")
+    for name in ("terrace", "room"):
+        shutil.make_archive(str(tmp_path / name), "zip", tmp_path, name)
+    expand(request(tmp_path / "terrace.zip", tmp_path), project=project)
+    expand(Request(photos=tmp_path / "room.zip"), project=project)
+    assert everything(project / "runs" / "room" / "scenes" / "room") == everything(tmp_path / "room")
+    copied = everything(project / "runs" / "terrace" / "scenes" / "terrace" / "captured")
+    assert copied == everything(tmp_path / "terrace")
+    assert sorted(path.name for path in (project / "runs").iterdir() if path.suffix == ".part") == []
+
+
+@pytest.mark.parametrize(("name", "place"), [("terrace", "terrace/2.png"), ("room", "room/captured/2.png")])
+def test_what_is_wrong_in_an_archive_is_named_by_the_archive(
+    name: str, place: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = photos(tmp_path / name) if name == "terrace" else scene(tmp_path / name)
+    (tmp_path / place).write_bytes(b"no picture")
+    shutil.make_archive(str(folder), "zip", tmp_path, name)
+    monkeypatch.setattr(command, "check_scene", preflight.check_scene)
+    given = request(tmp_path / f"{name}.zip", tmp_path) if name == "terrace" else Request(photos=tmp_path / "room.zip")
+    with pytest.raises(UserError) as caught:
+        expand(given, project=project)
+    assert caught.value.where == str(tmp_path / f"{name}.zip" / place)
+    assert not (project / "runs" / name / "source.json").exists()
+
+
 @pytest.mark.parametrize(("one", "two"), [("写真", "台所"), ("a b", "a_b"), ("Küche", "Kuche"), ("x" * 60, "x" * 70)])
 def test_names_that_become_one_do_not_share_a_run(one: str, two: str, project: Path, tmp_path: Path) -> None:
     first, second = photos(tmp_path / one), photos(tmp_path / two)
@@ -431,5 +459,5 @@ def test_what_costs_something_is_asked_for_first(
         with pytest.raises(UserError):
             command.agree_to_requests(forecasts, unattended=unattended)
     assert bool(asked) == (answer is not None)
-    assert all("3 requests to an image service, about 0.75 USD" in text for text in asked)
+    assert all("3 requests to paid services, about 0.75 USD" in text for text in asked)
     command.agree_to_requests([Forecast(prompt="free")], unattended=False)

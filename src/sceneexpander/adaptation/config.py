@@ -42,10 +42,12 @@ class SubsetRule(StrEnum):
 
 
 class InsertedWeights(StrEnum):
-    """How much each pixel of the inserted view counts in Eq. (gen): all alike (the paper), or by agreement and confidence."""
+    """How much each pixel of the inserted view counts in Eq. (gen): all alike (the paper), by agreement of its depth with the anchors and
+    by confidence, or less where the picture itself shows something else than the scene so far (see `AdaptationInputs.support`)."""
 
     UNIFORM = "uniform"
     CONSISTENT = "consistent"
+    SUPPORTED = "supported"
 
 
 class Spend(StrEnum):

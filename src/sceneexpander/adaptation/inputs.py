@@ -42,6 +42,9 @@ class AdaptationInputs:
     step that does not see the inserted view uses the former, so that with p = 0 nothing of the inserted view reaches the student.
     `adapt` brings the latter to the former's frame and scale, in which the anchors are.
     Models without priors get None for both.
+
+    ``support`` is 1 where nothing contradicts the inserted picture and 0 where the scene so far shows something else (of
+    `sceneexpander.artifacts.inserted.InsertedView`); None: not known. Only `InsertedWeights.SUPPORTED` looks at it.
     """
 
     captured: Float[Tensor, "captured 3 height width"]
@@ -49,6 +52,7 @@ class AdaptationInputs:
     anchors: Anchors
     captured_priors: Priors | None
     joint_priors: Priors | None
+    support: Float[Tensor, "height width"] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,6 +151,8 @@ def run_key(model: Reconstructor, inputs: AdaptationInputs, config: AdaptConfig,
     """Hash of everything that determines an adaptation: weights, views, anchors, priors, configuration, seed."""
     tensors: dict[str, Tensor] = {f"weights/{k}": v for k, v in as_module(model).state_dict().items()}
     tensors |= {"captured": inputs.captured, "inserted": inputs.inserted}
+    if inputs.support is not None:
+        tensors["support"] = inputs.support
     for label, value in (
         ("anchors", inputs.anchors),
         ("captured", inputs.captured_priors),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.adaptation.config import AdaptConfig, InsertedWeights
@@ -11,7 +12,7 @@ from sceneexpander.adaptation.inputs import StepViews, geometry_of, heads_of
 from sceneexpander.adaptation.ledger import WeightLedger, teacher_of
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import StepLosses, anchor_targets, step_losses
-from sceneexpander.adaptation.pixel_weights import inserted_weights
+from sceneexpander.adaptation.pixel_weights import inserted_weights, supported_weights
 from sceneexpander.adaptation.sampling import Batch
 from sceneexpander.models.protocol import Reconstructor, as_module
 
@@ -26,9 +27,10 @@ class Learner:
         config: AdaptConfig,
         *,
         seed: int,
+        support: Float[Tensor, "height width"] | None = None,
         bucket_elements: int | None = None,
     ) -> None:
-        self.model, self.anchors, self.config = model, anchors, config
+        self.model, self.anchors, self.config, self.support = model, anchors, config, support
         self.device = anchors.depth.device
         self.teacher: Reconstructor = teacher_of(model)
         for one in (model, self.teacher):
@@ -54,5 +56,7 @@ class Learner:
             weights = None
             if self.config.inserted_weights is InsertedWeights.CONSISTENT:
                 weights = inserted_weights(prediction, self.anchors.depth[list(captured)])
+            elif self.config.inserted_weights is InsertedWeights.SUPPORTED and self.support is not None:
+                weights = supported_weights(self.support)
         # As ordinary tensors, which a loss may keep.
         return taught.clone(), None if weights is None else weights.clone()

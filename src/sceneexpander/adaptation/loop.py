@@ -152,7 +152,7 @@ class Run:
             normals=inputs.anchors.normals,
             splats=self._frozen_splats(model) if config.alpha_gaussian > 0 else None,
         )
-        self.learner = Learner(model, anchors, config, seed=seed)
+        self.learner = Learner(model, anchors, config, seed=seed, support=inputs.support)
 
     @torch.no_grad()
     def _frozen_splats(self, model: Reconstructor) -> Tensor | None:

@@ -9,10 +9,21 @@ from torch import Tensor
 from sceneexpander.geometry.agreement import agreement
 from sceneexpander.models.protocol import Prediction
 
+CONTRADICTED = 0.1  # what a pixel counts that the scene so far contradicts
+
 
 def confidence_weight(confidence: Float[Tensor, "*batch height width"]) -> Float[Tensor, "*batch height width"]:
     """A confidence (> 1, larger is surer) as a weight in [0, 1): 1 - 1 / confidence."""
     return 1 - 1 / confidence.clamp(min=1)
+
+
+def supported_weights(support: Float[Tensor, "height width"]) -> Float[Tensor, "1 height width"]:
+    """Weights of the inserted view's pixels with mean 1: what the scene so far contradicts (0 in ``support``) counts a tenth of the rest.
+
+    Not nothing: an object that was asked for and stands before something photographed is contradicted, too.
+    """
+    weight = CONTRADICTED + (1 - CONTRADICTED) * support
+    return (weight / weight.mean())[None]
 
 
 @torch.no_grad()

@@ -31,6 +31,8 @@ class Provenance:
         created: when the answer came, UTC (ISO 8601); None: not known.
         usage: what the service counted, e.g. tokens.
         cost_usd: estimated from the configured price; None: no price is configured, or nothing was asked of a service.
+        prompt_given: the text before a chat model rewrote it; None: it was sent as it was.
+        rewritten_by: that model; None: nobody rewrote it.
         digital_source_type: IPTC's term for how the picture came to be, e.g. "trainedAlgorithmicMedia"; None: not known.
     """
 
@@ -45,6 +47,8 @@ class Provenance:
     created: str | None = None
     usage: dict[str, int] = field(default_factory=dict)
     cost_usd: float | None = None
+    prompt_given: str | None = None
+    rewritten_by: str | None = None
     digital_source_type: str | None = None
 
 

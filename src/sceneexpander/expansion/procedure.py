@@ -130,6 +130,7 @@ class Procedure:
                 anchors=_device_anchors(inputs.anchors, loaded),
                 captured_priors=device_priors(state.priors, loaded),
                 joint_priors=device_priors(inputs.joint_priors, loaded),
+                support=None if inputs.inserted.support is None else inputs.inserted.support.to(loaded.device),
             ),
             config,
             seed=seed,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from sceneexpander.artifacts.views import to_bytes
 from sceneexpander.exports.gltf import glb_bytes, load_trimesh
 from sceneexpander.exports.scene import ExportScene, ExportView
 from sceneexpander.files import complete_file
-from sceneexpander.geometry.camera import pixel_centres, unproject_to_world
+from sceneexpander.geometry.camera import pixel_centres
+from sceneexpander.geometry.rigid import transform_points
 
 POINTS_GLB = 300_000
 _LEAST_CONFIDENT = 0.1  # share of each view's pixels that are left out
@@ -44,21 +46,24 @@ def points_of_depth(scene: ExportScene, *, most: int) -> Points:
     wanted = {"all": (False, True), "generated": (True,), "captured": (False,)}[scene.statement.part]
     index_of = {view: index for index, view in enumerate(made.view_ids)}
     used = [(number, index_of[v.view_id]) for number, v in enumerate(scene.views) if v.generated in wanted]
-    places = pixel_centres(height, width, like=made.depth.double()).reshape(-1, 2)
-    places = places / places.new_tensor([width, height])
+    centres = pixel_centres(height, width, like=torch.empty(0, dtype=torch.float64)).reshape(-1, 2)
+    size = centres.new_tensor([width, height])
+    left_out = math.ceil(_LEAST_CONFIDENT * (height * width - 1))
     generator = torch.Generator().manual_seed(0)
     chosen: list[tuple[Tensor, ...]] = []
     for number, index in used:
         confidence = made.depth_conf[index].flatten()
-        sure = (confidence >= torch.quantile(confidence, _LEAST_CONFIDENT)).nonzero()[:, 0]
+        sure = (confidence >= confidence.kthvalue(left_out + 1).values).nonzero()[:, 0]
         pick = sure[torch.randperm(len(sure), generator=generator)[: most // len(used)]].sort().values
         pose, lens = made.world_from_cam[index].double(), made.intrinsics_px[index].double()
         # The exported pose, not its rounded copy: points project exactly where they came from.
         pose = scene.views[number].world_from_cam.to(pose)
-        xyz = unproject_to_world(made.depth[index].double(), lens, pose).reshape(-1, 3)[pick]
+        depth, uv = made.depth[index].flatten()[pick].double()[:, None], centres[pick]
+        rays = (uv - lens[:2, 2]) / lens.diagonal()[:2]
+        xyz = transform_points(pose, torch.cat([rays * depth, depth], 1))
         rgb = to_bytes(scene.images[index]).flatten(1).T[pick]
         view = torch.full((len(pick),), number)
-        chosen.append((xyz, rgb, view, places[pick], torch.full((len(pick),), scene.views[number].generated)))
+        chosen.append((xyz, rgb, view, uv / size, torch.full((len(pick),), scene.views[number].generated)))
     if not chosen:
         none = torch.zeros(0, dtype=torch.float64)
         empty = none.reshape(0, 3)

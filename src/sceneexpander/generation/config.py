@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 from sceneexpander.errors import UserError
+from sceneexpander.generation.rewrite import RewriteConfig
 from sceneexpander.ingest.config import FITS, Fit
 from sceneexpander.ranges import Range, check_ranges
 
@@ -53,6 +54,7 @@ class ServiceConfig(GeneratorConfig):
         timeout_s: how long an answer may take.
         max_references: most views that are shown to the generator.
         reference_side_px: long side of the pictures that are shown to it.
+        rewrite: the chat model that rewrites instructions first; None: they are sent as they are.
     """
 
     candidates: Annotated[int, Range(1, 100)]
@@ -66,6 +68,7 @@ class ServiceConfig(GeneratorConfig):
     timeout_s: Annotated[float, Range(0, 86_400, low_open=True)]
     max_references: Annotated[int, Range(1, 16)]
     reference_side_px: Annotated[int, Range(64, 4096)]
+    rewrite: RewriteConfig | None = None
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -20,6 +20,7 @@ from sceneexpander.generation.config import ServiceConfig
 from sceneexpander.generation.prompt import fill_prompt
 from sceneexpander.generation.protocol import Forecast, GenerationContext, SceneSoFar
 from sceneexpander.generation.references import Reference, choose_references
+from sceneexpander.generation.rewrite import Rewriter, Wording
 from sceneexpander.generation.spending import SceneBudget, read_spent, spent_ledger
 from sceneexpander.ingest.decode import decode_picture
 from sceneexpander.services.transport import Budget, ServiceError, ask_patiently, safe_text
@@ -32,11 +33,16 @@ MAX_MEGAPIXELS = 40.0  # of an answer: no service is asked for as much
 class Question:
     """What a service is asked for one picture. ``height`` and ``width`` are those of the captured frame, for its ratio."""
 
-    prompt: str
+    wording: Wording
     references: tuple[Reference, ...]
     number: int
     height: int
     width: int
+
+    @property
+    def prompt(self) -> str:
+        """The instruction."""
+        return self.wording.sent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,30 +86,45 @@ class ServiceGenerator:
 
     def check(self, context: GenerationContext) -> Forecast:
         """Count what is not in the cache yet; nothing is sent. See `ViewGenerator`."""
-        missing = max(0, self.config.candidates - self._cache(context).count())
+        rewriter = self._rewriter(context)
+        wording = rewriter.kept(context.spec)
+        # Nobody knows what an instruction that is not there yet would have been answered with.
+        there = 0 if wording is None else self._cache(context, wording).count()
+        missing = max(0, self.config.candidates - there)
         if missing:
             self.service.require()
         price, spent = self.config.price_usd, read_spent(spent_ledger(context))
+        costs = [price] * missing
         shown = min(self.config.max_references, len(context.captured) + context.round_number - 1)
         notes = (
             f"shows the {shown} views nearest to where the motion leads, at most {self.config.reference_side_px} px long",
             *([f"{len(spent)} requests were sent for this scene before"] if spent else []),
         )
+        if wording is None and rewriter.config is not None:
+            costs.append(rewriter.config.price_usd)
+            notes = (f"{rewriter.config.model} rewrites the prompt first, which is one of the requests", *notes)
+        elif wording is not None and wording.given is not None:
+            notes = (f"rewritten by {wording.by} from: {wording.given}", *notes)
+        known = [cost for cost in costs if cost is not None]
         return Forecast(
-            prompt=fill_prompt(context.spec),
-            requests=missing,
-            cost_usd=None if price is None else price * missing,
+            prompt=fill_prompt(context.spec) if wording is None else wording.sent,
+            requests=len(costs),
+            cost_usd=sum(known) if len(known) == len(costs) else None,
             notes=notes,
         )
 
     def generate(self, context: GenerationContext, so_far: SceneSoFar) -> CandidateSet:
         """One request per candidate that is not in the cache; see `ViewGenerator`."""
         config = self.config
+        what = f"the instruction of round {context.round_number}"
+        wording = self._rewriter(context).rewrite(context.spec, what=what)
+        if wording.given is not None:
+            logger.info("%s, by %s: %s", what, wording.by, wording.sent)
         references = choose_references(
             context, so_far, limit=config.max_references, long_side_px=config.reference_side_px
         )
         keys = {reference.view_id: reference.pixels_sha256 for reference in references}
-        cache, budget = self._cache(context), self._budget(context)
+        cache, budget = self._cache(context, wording), self._budget(context)
         candidates: list[Candidate] = []
         outcomes: list[Outcome] = []
         errors: list[ServiceError] = []
@@ -113,7 +134,7 @@ class ServiceGenerator:
             try:
                 if kept is None:
                     question = Question(
-                        prompt=fill_prompt(context.spec),
+                        wording=wording,
                         references=references,
                         number=number,
                         height=context.captured.height,
@@ -155,12 +176,15 @@ class ServiceGenerator:
             price_usd=config.price_usd,
         )
 
-    def _cache(self, context: GenerationContext) -> AnswerCache:
+    def _rewriter(self, context: GenerationContext) -> Rewriter:
+        return Rewriter(self.config.rewrite, context.cache, self.sleep)
+
+    def _cache(self, context: GenerationContext, wording: Wording) -> AnswerCache:
         config = self.config
         question = {
             "backend": config.backend,
             "service": self.service.identity(),
-            "prompt": fill_prompt(context.spec),
+            "prompt": wording.sent,
             "take": config.take,
             "ratio": [context.captured.height, context.captured.width],
             "reference_side_px": config.reference_side_px,
@@ -206,6 +230,8 @@ class ServiceGenerator:
         return Provenance(
             backend=self.config.backend,
             prompt=question.prompt,
+            prompt_given=question.wording.given,
+            rewritten_by=question.wording.by,
             source=reply.model,
             sha256=sha256_of_bytes(reply.data),
             reference_sha256=tuple(reference.record_sha256 for reference in question.references),

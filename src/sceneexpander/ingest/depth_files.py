@@ -6,6 +6,7 @@ import contextlib
 import io
 import math
 import struct
+import tokenize
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -20,6 +21,10 @@ from sceneexpander.plainfiles import read_plain_file
 _LIMIT_BYTES = 512 * 2**20
 _FARTHEST = 1e6
 _MOST_PIXELS = 200_000_000
+# What NumPy raises for a header that is none: it takes it for Python's words.
+_HEADER_ERRORS = (
+    ValueError, EOFError, OSError, SyntaxError, TypeError, LookupError, RecursionError, MemoryError, tokenize.TokenError,
+)  # fmt: skip
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SIXTEEN_BIT_MISSING = 65535  # Kinect's and others' word for "nothing seen"
 
@@ -83,7 +88,7 @@ def _read_npy(data: bytes, path: Path, _: tuple[int, int]) -> np.ndarray:
         version = np.lib.format.read_magic(file)
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, by_columns, dtype = header(file, max_header_size=2000)
-    except (ValueError, EOFError, OSError, SyntaxError, TypeError, LookupError, RecursionError) as error:
+    except _HEADER_ERRORS as error:
         reason = " ".join(str(error).split())[:80]
         raise UserError(f"is no NumPy array ({reason})", where=path) from None
     if dtype.kind not in "fiu":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import struct
 import zlib
+from pathlib import Path
 
 from PIL import Image, features
 
@@ -78,6 +79,18 @@ _FEATURES = {"AVIF": "avif", "JPEG2000": "jpg_2000", "WEBP": "webp"}
 PILLOW_FORMATS = {"JPEG": ["JPEG", "MPO"], "JPEG XL": ["JXL"]}
 
 
+_HEAD_BYTES = 64
+
+
+def read_head(path: Path) -> bytes:
+    """The first bytes of a file, which the functions here look at; none if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(_HEAD_BYTES)
+    except (OSError, ValueError):
+        return b""
+
+
 def kind_of_file(extension: str) -> str:
     """What to call a file that is left out because of its extension; empty where that says nothing."""
     if extension in _VIDEO:
@@ -144,7 +157,12 @@ def name_of_content(head: bytes) -> str | None:
         b"qoif": "a QOI picture",
         b"\xabKTX": "a KTX texture",
         b"DDS ": "a DDS texture",
+        b"PK\x05\x06": "an empty ZIP archive",
         b"\x1f\x8b": "a gzip archive",
+        b"7z\xbc\xaf\x27\x1c": "a 7z archive",
+        b"Rar!\x1a\x07": "a RAR archive",
+        b"\xfd7zXZ\0": "an xz archive",
+        b"BZh": "a bzip2 archive",
     }
     return next((words for start, words in known.items() if head.startswith(start)), None)
 

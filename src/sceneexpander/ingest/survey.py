@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sceneexpander.errors import UserError, printable
-from sceneexpander.ingest.formats import PICTURE_EXTENSIONS, kind_of_file, sniff_format
+from sceneexpander.ingest.formats import PICTURE_EXTENSIONS, kind_of_file, read_head, sniff_format
 from sceneexpander.ingest.links import require_inside
 from sceneexpander.plainfiles import kind_of, list_folder, require_plain_file
 
 MASKS_FOLDER = "masks"  # beside pictures: which of their pixels are to be used
-_HEAD_BYTES = 64
 _MOST_LISTED = 8  # names in one line
 _MOST_LOOKED_AT = 2000  # files of sub-folders, when there is no picture in the folder itself
 _DEEPEST = 3
@@ -99,7 +98,7 @@ def _kind(path: Path, inside: Path | None) -> str:
             require_plain_file(path)
         return kind_of(mode)
     kind = kind_of_file(extension)
-    if not named and (kind or sniff_format(_head(path)) is None):
+    if not named and (kind or sniff_format(read_head(path)) is None):
         return kind or "not a picture"
     require_text_name(path)
     if inside is not None:
@@ -113,14 +112,6 @@ def require_text_name(path: Path) -> None:
         path.name.encode()
     except UnicodeEncodeError:
         raise UserError("has a name that is not valid text (UTF-8)", where=path, fix="rename the file") from None
-
-
-def _head(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(_HEAD_BYTES)
-    except OSError:
-        return b""
 
 
 def _is_companion(name: str) -> bool:

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from sceneexpander.artifacts.cameras import CameraReport
-from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.judgement import FILE_NAME as JUDGEMENT
 from sceneexpander.artifacts.metrics import MetricsRow, load_row
 from sceneexpander.artifacts.page import (
@@ -200,7 +200,7 @@ def _round(source: RoundSource, scene_source: SceneSource, folder: Path) -> Roun
         prompt=spec.prompt,
         motion=spec.motion,
         new_object=spec.new_object,
-        full_prompt=chosen.prompt,
+        full_prompt=_told(chosen),
         backend=chosen.backend,
         origin=Path(chosen.source).name,
         source_type=kind,
@@ -283,6 +283,13 @@ def _problems(source: RoundSource, scene: SceneSource, folder: Path, base: str) 
     lines = [line for title, cameras in found for line in (f"{title}: {cameras.summary()}", *cameras.problems(), "")]
     write_bytes_atomic(folder / place, "\n".join(lines).encode())
     return place
+
+
+def _told(how: Provenance) -> str:
+    """What the generator was told, and from what a chat model made it."""
+    if how.prompt_given is None:
+        return how.prompt
+    return f"{how.prompt}\n\nRewritten by {how.rewritten_by} from: {how.prompt_given}"
 
 
 def _looks(source: Path, folder: Path, base: str) -> LooksPage | None:

@@ -15,10 +15,11 @@ A comment says how opacities are meant (`Gaussians.antialiased`), as gsplat, ner
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -32,6 +33,7 @@ from sceneexpander.splatting.scene import check_finite
 
 Linear = Literal["opacity", "scale"]
 ROWS_PER_CHUNK = 65536  # written at once, bounds the memory
+ROWS_PER_READ = 8192  # small enough to stay in the processor's cache
 OPACITY_MARGIN = 1e-6  # logits of exactly 0 or 1 would be infinite, which viewers do not expect
 SMALLEST_SCALE = 1e-30
 MAX_HEADER_BYTES = 1 << 16
@@ -142,13 +144,13 @@ def read_ply(path: Path, *, linear: Collection[Linear] = ()) -> Gaussians:
     try:
         with path.open("rb") as file:
             header = _read_header(file, path)
-            table = _read_table(file, header, path)
+            stored = _gather(_read_rows(file, header, path), header, path)
     except FileNotFoundError:
         raise UserError("does not exist", where=path) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"cannot be read ({reason})", where=str(path)[:300]) from None
-    return _gaussians(table, header, path, frozenset(linear))
+    return _gaussians(stored, header, path, frozenset(linear))
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +163,7 @@ class _Header:
     antialiased: bool  # as a comment says; without one they are not
 
 
-def _read_header(file: BinaryIO, path: Path) -> _Header:
+def _read_header(file: BufferedReader, path: Path) -> _Header:
     raw = file.read(MAX_HEADER_BYTES)
     if not raw.startswith((b"ply\n", b"ply\r")):
         raise UserError("is not a PLY file (does not start with 'ply')", where=path)
@@ -207,8 +209,8 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
     return _Header(encoding, elements[at][1], properties, skip, at == len(elements) - 1, antialiased)
 
 
-def _read_table(file: BinaryIO, header: _Header, path: Path) -> NDArray[np.void]:
-    """The vertices as a structured array."""
+def _read_rows(file: BufferedReader, header: _Header, path: Path) -> Iterator[NDArray[np.void]]:
+    """The vertices as structured arrays, some thousands at a time; each is gone with the next."""
     missing = [name for name in (*FIXED, *ROTATION) if name not in dict(header.properties)]
     if missing and COMPRESSED & set(dict(header.properties)):
         fix = "convert it to a plain PLY first, e.g. with splat-transform"
@@ -218,7 +220,8 @@ def _read_table(file: BinaryIO, header: _Header, path: Path) -> NDArray[np.void]
     order = BYTE_ORDERS.get(header.encoding, "=")
     dtype = np.dtype([(name, order + kind) for name, kind in header.properties])
     if header.encoding == "ascii":
-        return _read_ascii(file, header, dtype, path)
+        yield _read_ascii(file, header, dtype, path)
+        return
     start = file.tell() + header.skip
     available = path.stat().st_size - start
     expected = header.count * dtype.itemsize
@@ -231,10 +234,15 @@ def _read_table(file: BinaryIO, header: _Header, path: Path) -> NDArray[np.void]
             f"is longer than its {header.count} vertices: {available} bytes instead of {expected}", where=path
         )
     file.seek(start)
-    return np.fromfile(file, dtype, header.count)
+    table = np.empty(min(header.count, ROWS_PER_READ), dtype)
+    for at in range(0, header.count, ROWS_PER_READ):
+        rows = table[: header.count - at]
+        if file.readinto(rows.view(np.uint8).data) != rows.nbytes:
+            raise UserError("became shorter while it was read", where=path)
+        yield rows
 
 
-def _read_ascii(file: BinaryIO, header: _Header, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
+def _read_ascii(file: BufferedReader, header: _Header, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
     lines = file.read().split(b"\n")[header.skip :]
     rows = [line for line in lines if line.strip()]
     if len(rows) < header.count or (header.is_last and len(rows) > header.count):
@@ -248,18 +256,63 @@ def _read_ascii(file: BinaryIO, header: _Header, dtype: np.dtype[np.void], path:
     return table
 
 
-def _columns(table: NDArray[np.void], wanted: tuple[str, ...]) -> NDArray[np.float32]:
-    """The named properties side by side as float32."""
+def _gather(chunks: Iterable[NDArray[np.void]], header: _Header, path: Path) -> Gaussians:
+    """The vertices as they are stored: opacities may be logits and scales logarithms."""
+    count, kinds = header.count, dict(header.properties)
+    rest = sum(name.startswith("f_rest_") for name in kinds)
+    if rest not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(rest)):
+        raise UserError(f"has {rest} f_rest properties, expected f_rest_0.. with 0, 9, 24 or 45 of them", where=path)
+    # Files hold harmonics channel by channel, we coefficient by coefficient.
+    higher = [f"f_rest_{channel * (rest // 3) + i}" for i in range(rest // 3) for channel in range(3)]
+    groups = {
+        "means": ("x", "y", "z"),
+        "quat_wxyz": ROTATION,
+        "scales": ("scale_0", "scale_1", "scale_2"),
+        "opacities": ("opacity",),
+        "sh": ("f_dc_0", "f_dc_1", "f_dc_2", *higher),
+    }
+    values = {name: torch.empty(0, len(wanted)) for name, wanted in groups.items()}
+    source_view, generated = torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.bool)
+    at = 0
+    for table in chunks:
+        if at == 0:  # not before: a header alone may announce anything
+            values = {name: torch.empty(count, len(wanted)) for name, wanted in groups.items()}
+            source_view, generated = torch.full((count,), -1), torch.zeros(count, dtype=torch.bool)
+        rows = slice(at, at + len(table))
+        at += len(table)
+        for name, wanted in groups.items():
+            _take_columns(table, wanted, values[name][rows])
+        if "source_view" in kinds:
+            numbers = table["source_view"].astype(np.float64)
+            if not (np.abs(numbers) < MOST_VIEWS).all():  # NaN neither
+                raise UserError("has a source_view that is no number of a view", where=path)
+            source_view[rows] = torch.from_numpy(numbers.astype(np.int64))
+        if "generated" in kinds:
+            generated[rows] = torch.from_numpy(table["generated"] != 0)
+    return Gaussians(
+        means=values["means"],
+        quat_wxyz=values["quat_wxyz"],
+        scales=values["scales"],
+        opacities=values["opacities"][:, 0],
+        sh=values["sh"].reshape(at, 1 + rest // 3, 3),
+        source_view=source_view,
+        generated=generated,
+        antialiased=header.antialiased,
+    )
+
+
+def _take_columns(table: NDArray[np.void], wanted: Sequence[str], target: Tensor) -> None:
+    """Fill ``target`` (rows, properties) with the named properties."""
     fields = dict(table.dtype.fields or {})
-    offsets = [fields[name][1] for name in wanted]
-    # Neighbours of the usual type are one block of bytes, many times faster to take than property by property.
-    if len(table) and wanted and all(fields[name][0] == "<f4" for name in wanted) and np.all(np.diff(offsets) == 4):
-        rows = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
-        return np.ascontiguousarray(rows[:, offsets[0] : offsets[-1] + 4]).view("<f4").astype(np.float32, copy=False)
-    stacked = np.empty((len(table), len(wanted)), np.float32)
-    for i, name in enumerate(wanted):
-        stacked[:, i] = table[name]
-    return stacked
+    offsets = np.array([fields[name][1] for name in wanted])
+    first, end = int(offsets.min()), int(offsets.max()) + 4
+    if all(fields[name][0] == np.float32 for name in wanted) and not ((offsets - first) % 4).any():
+        # One block of bytes, many times faster to take than property by property.
+        block = table.view(np.uint8).reshape(len(table), -1)[:, first:end].copy().view(np.float32)
+        torch.index_select(torch.from_numpy(block), 1, torch.from_numpy((offsets - first) // 4), out=target)
+        return
+    for column, name in enumerate(wanted):
+        target[:, column] = torch.from_numpy(table[name].astype(np.float32))
 
 
 def _refuse_linear(opacities: Tensor, scales: Tensor, means: Tensor, path: Path) -> None:
@@ -297,46 +350,25 @@ def _refuse_linear(opacities: Tensor, scales: Tensor, means: Tensor, path: Path)
         _log.warning("%s: all %s; taken for %s", path, what, "logits" if within else "logarithms")
 
 
-def _gaussians(table: NDArray[np.void], header: _Header, path: Path, linear: frozenset[Linear]) -> Gaussians:
-    names = table.dtype.names or ()
-    rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in REST_COUNTS or any(f"f_rest_{i}" not in names for i in range(rest)):
-        raise UserError(f"has {rest} f_rest properties, expected f_rest_0.. with 0, 9, 24 or 45 of them", where=path)
-
-    def columns(*wanted: str) -> Tensor:
-        return torch.from_numpy(_columns(table, wanted))
-
-    higher = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(len(table), 3, rest // 3).transpose(1, 2)
-    unknown = np.full(len(table), -1, np.int64)
-    if (
-        "source_view" in names and not (np.abs(table["source_view"].astype(np.float64)) < MOST_VIEWS).all()
-    ):  # NaN neither
-        raise UserError("has a source_view that is no number of a view", where=path)
-    source_view = table["source_view"].astype(np.int64) if "source_view" in names else unknown
-    means, opacities, scales = (
-        columns("x", "y", "z"),
-        columns("opacity")[:, 0],
-        columns("scale_0", "scale_1", "scale_2"),
-    )
+def _gaussians(stored: Gaussians, header: _Header, path: Path, linear: frozenset[Linear]) -> Gaussians:
     # What was written here says so by its provenance.
-    if not linear and not set(PROVENANCE) <= set(names):
-        _refuse_linear(opacities, scales, means, path)
-    if "opacity" in linear and not bool(((opacities >= 0) & (opacities <= 1)).all()):
+    if not linear and not set(PROVENANCE) <= set(dict(header.properties)):
+        _refuse_linear(stored.opacities, stored.scales, stored.means, path)
+    if "opacity" in linear and not bool(((stored.opacities >= 0) & (stored.opacities <= 1)).all()):
         raise UserError("has opacities outside 0 to 1: they are not linear", where=path)
-    if "scale" in linear and not bool((scales > 0).all()):
+    if "scale" in linear and not bool((stored.scales > 0).all()):
         raise UserError("has scales that are not above 0: they are not linear", where=path)
-    scene = Gaussians(
-        means=means,
-        quat_wxyz=columns(*ROTATION),
-        scales=scales if "scale" in linear else scales.exp(),
-        opacities=opacities if "opacity" in linear else opacities.sigmoid(),
-        sh=torch.cat([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], higher], 1),
-        source_view=torch.from_numpy(source_view),
-        generated=torch.from_numpy(table["generated"] != 0 if "generated" in names else np.zeros(len(table), bool)),
-        antialiased=header.antialiased,
+    scene = replace(
+        stored,
+        scales=stored.scales if "scale" in linear else stored.scales.exp_(),
+        opacities=stored.opacities if "opacity" in linear else stored.opacities.sigmoid(),
     )
     for name in ("means", "quat_wxyz", "scales", "opacities", "sh"):
-        bad = (~torch.isfinite(getattr(scene, name))).nonzero()
+        value = getattr(scene, name)
+        # A sum with NaN or inf in it is never finite; one that is not may have overflowed by itself.
+        if bool(torch.isfinite(value.sum())):
+            continue
+        bad = (~torch.isfinite(value)).nonzero()
         if len(bad):
             raise UserError(f"vertex {int(bad[0, 0])} has {name} that are not finite", where=path)
     flat = (scene.quat_wxyz == 0).all(-1)

@@ -14,6 +14,7 @@ from sceneexpander.adaptation.loop import (
     StepRecord,
     adapt,
 )
+from sceneexpander.adaptation.pixel_weights import CONTRADICTED, supported_weights
 from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.errors import UserError
 from tests.support.tiny_model import TinyReconstructor
@@ -214,6 +215,25 @@ def test_a_non_finite_loss_stops_the_run_and_names_the_term() -> None:
 def test_views_and_anchors_must_match(change: Callable[[AdaptationInputs], AdaptationInputs]) -> None:
     with pytest.raises(ValueError, match="3 captured views, 4 anchors"):
         run_steps(inputs=change(inputs_for()))
+
+
+def test_what_the_scene_contradicts_counts_less_in_the_inserted_loss_only() -> None:
+    config = replace(FAST, insertion_probability=1.0, lambda_anchor=0.0, lambda_reg=0.0, augment=NO_AUGMENT)
+    supported = replace(config, inserted_weights=InsertedWeights.SUPPORTED)
+    inputs = inputs_for()
+    support = torch.ones(inputs.inserted.shape[-2:])
+    half = support.clone()
+    half[: len(half) // 2] = 0
+    uniform, unknown = run_steps(config, inputs), run_steps(supported, inputs)
+    weighted = run_steps(supported, replace(inputs, support=half))
+    assert _bits(uniform) == _bits(unknown) == _bits(run_steps(supported, replace(inputs, support=support)))
+    assert _bits(uniform) == _bits(run_steps(config, replace(inputs, support=half))), "only where it is asked for"
+    assert weighted.records[0].anchor_depth == uniform.records[0].anchor_depth
+    assert weighted.records[0].gen_camera == uniform.records[0].gen_camera
+    assert _bits(weighted) != _bits(uniform)
+    weights = supported_weights(half)[0]
+    assert float(weights.mean()) == pytest.approx(1)
+    assert float(weights[0, 0] / weights[-1, 0]) == pytest.approx(CONTRADICTED)
 
 
 def test_consistent_weights_change_the_inserted_loss_only() -> None:

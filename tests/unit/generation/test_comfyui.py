@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,8 @@ class Comfy:
             image = {"filename": f"{run}.png", "subfolder": "", "type": "output"}
             done = {"outputs": {"4": {"images": [image]}}, "status": {"status_str": "success", "completed": True}}
             return said({} if self.polled % 3 else {run: done})
+        if path == "/queue":
+            return said({"queue_running": [], "queue_pending": []})
         assert path == "/view"
         return Answer(body=drawn(self.pictures), content_type="image/png")
 
@@ -114,6 +117,30 @@ def test_our_nodes_are_filled_and_the_others_stay(
     changed = json.loads(json.dumps(WORKFLOW))
     changed["3"]["inputs"]["steps"] = 21
     assert generator(comfy, tmp_path, "generator.seed=7", workflow=changed).check(context).requests == 2
+
+
+@pytest.mark.parametrize(
+    ("queue", "words"),
+    [
+        (
+            {"queue_running": [[3, "other", {}]], "queue_pending": [[5, "run1", {}], [4, "next", {}], [6, "x", {}]]},
+            "2 before it",
+        ),
+        ({"queue_running": [[5, "run1", {}]], "queue_pending": []}, "the workflow is running"),
+        ({"queue_running": "?", "queue_pending": [[], ["a", "run1"], 7]}, None),
+        (["x"], None),
+    ],
+)
+def test_where_the_workflow_stands_is_said_once(
+    queue: object, words: str | None, comfy: Comfy, so_far: SceneSoFar, context: GenerationContext, tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    comfy.said["/queue"] = said(queue)
+    with caplog.at_level(logging.INFO):
+        generator(comfy, tmp_path, "generator.candidates=1").generate(context, so_far)
+    told = [record.getMessage() for record in caplog.records if record.getMessage().startswith("ComfyUI: ")]
+    assert len(told) == (words is not None)
+    assert words is None or words in told[0]
 
 
 @pytest.mark.parametrize(

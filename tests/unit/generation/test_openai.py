@@ -18,18 +18,12 @@ from PIL import Image
 from sceneexpander.artifacts.candidates import CandidateSet
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.source_type import MADE_BY_MODEL
-from sceneexpander.config.compose import compose
-from sceneexpander.config.parse import parse_dataclass
-from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.generation import ChoiceConfig, GenerationContext, SceneSoFar, choose_view
-from sceneexpander.generation.backends.openai import OpenAIConfig, OpenAIService, asked_size
-from sceneexpander.generation.service import ServiceGenerator
+from sceneexpander.generation.backends.openai import asked_size
 from tests.unit.generation.loopback import Answer, Service, drawn, error, picture, said, serving
+from tests.unit.generation.openai_service import KEY, generator, settings
 from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
-
-CONF = Path(__file__).parents[3] / "conf"
-KEY = "sk-verysecret0123456789"
 
 
 @pytest.fixture
@@ -49,18 +43,6 @@ def so_far() -> SceneSoFar:
 def context(so_far: SceneSoFar, tmp_path: Path) -> GenerationContext:
     spec = RoundSpec(prompt="x", motion="move right 30 %", new_object="a bench")
     return context_of(Scene(name="s", views=so_far.views, rounds=(spec,)), tmp_path / "scene")
-
-
-def settings(service: Service, **changes: Any) -> OpenAIConfig:
-    config = parse_dataclass(ProjectConfig, compose(CONF, ["generator=openai"])).generator
-    assert isinstance(config, OpenAIConfig)
-    given = {"base_url": f"{service.address}/v1", "key_variable": "TEST_KEY", "timeout_s": 20.0, "price_usd": 0.04}
-    return replace(config, **(given | changes))
-
-
-def generator(service: Service, waits: list[float] | None = None, **changes: Any) -> ServiceGenerator:
-    config = settings(service, **changes)
-    return ServiceGenerator(config, OpenAIService(config), sleep=([] if waits is None else waits).append)
 
 
 def test_what_is_sent_and_what_is_recorded(

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import ast
-import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 import torch
@@ -25,125 +22,24 @@ from sceneexpander.ingest.depth_files import DepthFile, DepthFormat
 from sceneexpander.ingest.lens_models import Lens, Projection, straighten_picture
 from sceneexpander.ingest.sources import SOURCES, Capture, Shot, find_source, read_capture
 from sceneexpander.ingest.sources.posed import write_posed_photos
+from tests.worlds.captures import (
+    CONFIG,
+    MAKERS,
+    SIZE,
+    camera_texts,
+    colmap,
+    eth3d,
+    metashape,
+    pictures,
+    pose,
+    reality_capture,
+    transforms,
+    video,
+)
 from tests.worlds.photos import texture
 
 pytestmark = pytest.mark.timeout(120)
-CONFIG = IngestConfig(long_side_px=112)
 ROUNDS = [make_round("A bench.")]
-SIZE = (180, 240)
-
-
-def pose(k: int) -> np.ndarray:
-    """World from camera of picture k, OpenCV axes."""
-    angle = 0.1 * k
-    made = np.eye(4)
-    made[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    made[:3, 3] = [100 + 0.3 * k, 0.1 * k, 2.0]
-    return made
-
-
-def pictures(folder: Path, names: list[str]) -> None:
-    for seed, name in enumerate(names):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        texture(seed, *SIZE).save(folder / name)
-
-
-def quat_wxyz(rotation: np.ndarray) -> np.ndarray:
-    w = np.sqrt(max(0, 1 + np.trace(rotation))) / 2
-    skew = rotation - rotation.T
-    return np.array([w, *(np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / (4 * w))])
-
-
-def colmap(folder: Path, camera: str = "PINHOLE 240 180 200 201 119 91") -> None:
-    pictures(folder / "images", ["sub/0.png", "sub/1.png", "sub/2.png"])
-    lines = ["# comment"]
-    for k in (*range(3), 7):
-        cam = np.linalg.inv(pose(k))
-        numbers = " ".join(f"{value:.17g}" for value in (*quat_wxyz(cam[:3, :3]), *cam[:3, 3]))
-        lines += [f"{k + 1} {numbers} 1 sub/{k}.png", "" if k else "1.0 2.0 -1"]
-    (folder / "sparse" / "0").mkdir(parents=True)
-    (folder / "sparse" / "0" / "images.txt").write_text("\n".join(lines) + "\n")
-    (folder / "sparse" / "0" / "cameras.txt").write_text(f"# comment\n1 {camera}\n")
-
-
-def transforms(folder: Path) -> None:
-    pictures(folder / "images", ["0.png", "1.png", "2.png"])
-    flip = np.diag([1.0, -1, -1, 1])
-    frames = [{"file_path": f"images/{k}.png", "transform_matrix": (pose(k) @ flip).tolist()} for k in (0, 1, 2, 7)]
-    frames[1] |= {"fl_x": 150.0, "fl_y": 151.0}
-    shared = {"camera_model": "OPENCV", "fl_x": 200, "fl_y": 201, "cx": 119, "cy": 91, "w": 240, "h": 180}
-    applied = {"applied_transform": np.eye(4)[:3].tolist()}
-    (folder / "transforms.json").write_text(json.dumps({**shared, **applied, "frames": frames}))
-
-
-def camera_texts(folder: Path) -> None:
-    pictures(folder / "images", ["0.png", "1.png", "2.png"])
-    (folder / "cameras").mkdir()
-    (folder / "depths").mkdir()
-    for k in (0, 2):
-        rows = [*pose(k)[:3].tolist(), [200, 0, 119], [0, 201, 91], [0, 0, 1]]
-        (folder / "cameras" / f"{k}.txt").write_text("\n".join("\t".join(map(repr, row)) for row in rows))
-    np.save(folder / "depths" / "0.npy", np.full(SIZE, 2.5, np.float32))
-
-
-def camera_params(folder: Path) -> None:
-    pictures(folder, ["0.png", "1.png", "2.png"])
-    content = {
-        "num_cameras": 3,
-        "extrinsics": [{"camera_id": k, "matrix": pose(k).tolist()} for k in range(3)],
-        "intrinsics": [{"camera_id": "1", "matrix": [[200, 0, 119], [0, 201, 91], [0, 0, 1]]}],
-    }
-    (folder / "camera_params.json").write_text(json.dumps(content))
-
-
-def seven_scenes(folder: Path) -> None:
-    pictures(folder, [f"frame-{k:06d}.color.png" for k in range(3)])
-    for k in range(3):
-        text = "\n".join("\t ".join(f"{value:.7e}" for value in row) + "\t " for row in pose(k))
-        (folder / f"frame-{k:06d}.pose.txt").write_text(text)
-        Image.fromarray(np.full(SIZE, 1000, np.uint16)).save(folder / f"frame-{k:06d}.depth.png")
-
-
-def metashape(folder: Path) -> None:
-    pictures(folder, ["0.png", "1.png", "2.png"])
-    cameras = "".join(
-        f'<camera id="{k}" sensor_id="0" label="{k}"><transform>{" ".join(map(repr, pose(k).ravel().tolist()))}</transform></camera>'
-        for k in range(3)
-    )
-    sensor = '<sensor id="0" type="frame"><resolution width="240" height="180"/>'
-    sensor += '<calibration type="frame"><f>200</f><cx>-1</cx><cy>1</cy></calibration></sensor>'
-    body = f'<chunk label="c"><sensors>{sensor}</sensors><cameras>{cameras}</cameras></chunk>'
-    (folder / "cameras.xml").write_text(f'<?xml version="1.0"?><document version="2.0">{body}</document>')
-
-
-def video(folder: Path, *, quarter_turn: bool = False) -> None:
-    path = folder / "walk.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = SIZE[1], SIZE[0], "yuv420p"
-        for k in range(30):
-            made = texture(k // 10, *SIZE)
-            blurred = made if k % 10 == 4 else made.resize((24, 18)).resize(SIZE[::-1], Image.Resampling.BILINEAR)
-            frame = av.VideoFrame.from_image(blurred)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    if quarter_turn:  # the display matrix of the track header: shown a quarter turn clockwise
-        data = bytearray(path.read_bytes())
-        place = data.index(b"tkhd") + 4 + 40
-        one = 1 << 16
-        for index, value in enumerate((0, one, 0, -one, 0, 0, 0, 0, 1 << 30)):
-            data[place + 4 * index : place + 4 * index + 4] = value.to_bytes(4, "big", signed=True)
-        path.write_bytes(bytes(data))
-
-
-MAKERS: dict[str, Callable[[Path], None]] = {
-    "colmap": colmap,
-    "transforms": transforms,
-    "camera_texts": camera_texts,
-    "camera_params": camera_params,
-    "seven_scenes": seven_scenes,
-    "metashape": metashape,
-}
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -303,6 +199,75 @@ def test_masks_beside_pictures_are_not_used_pixels(tmp_path: Path) -> None:
     valid = load_photos(tmp_path, ROUNDS, CONFIG).views.validity()
     assert float(valid[0].float().mean()) == pytest.approx(0.5, abs=0.05)
     assert bool(valid[1].all())
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_the_transform_of_a_metashape_chunk_is_applied(tmp_path: Path, far: bool) -> None:
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    shift = np.array([4_000_000.0, 1, 2]) if far else np.array([5.0, 1, 2])
+    words = [" ".join(map(str, part.ravel().tolist())) for part in (turn, shift)]
+    inner = f'<rotation locked="false">{words[0]}</rotation><translation>{words[1]}</translation><scale>2.5</scale>'
+    metashape(tmp_path, f"<transform>{inner}</transform>")
+    capture = read_capture(tmp_path, CONFIG)
+    assert capture.metric
+    points = np.array([[0.1, 0.2, 1.0], [-0.4, 0.3, 2.0]])
+    for k, shot in enumerate(capture.shots):
+        assert shot.world_from_cam is not None
+        # Of a point of the chunk's frame, where the camera sees it must stay the same.
+        of_chunk = points @ pose(k)[:3, :3].T + pose(k)[:3, 3]
+        of_world = 2.5 * of_chunk @ turn.T + (0 if far else shift)
+        of_camera = (of_world - shot.world_from_cam[:3, 3]) @ shot.world_from_cam[:3, :3]
+        np.testing.assert_allclose(of_camera / 2.5, points, atol=1e-9)
+    assert any("placed on the Earth" in note for note in capture.notes) is far
+
+
+def test_the_lens_of_reality_capture_is_in_units_of_the_longer_side(tmp_path: Path) -> None:
+    reality_capture(tmp_path)
+    lens = read_capture(tmp_path, CONFIG).shots[0].lens
+    assert lens is not None
+    # The vendor's equations: distortion first, then the focal length, then pixels from the middle.
+    ray = np.array([0.3, -0.2])
+    square = float(ray @ ray)
+    bent = ray * (1 + 0.1 * square - 0.02 * square**2 + 0.003 * square**3)
+    expected = (30 / 36 * bent + [-0.01, 0.005]) * 240 + [120, 90]
+    np.testing.assert_allclose(lens.distorted((ray * lens.focal_px + lens.centre_px)[None])[0], expected, atol=1e-9)
+    path = tmp_path / "0.xmp"
+    path.write_text(path.read_text().replace("0.003 0 0 0", "0.003 0 0.1 0"))
+    with pytest.raises(UserError, match="model brown3 that is not read"):
+        read_capture(tmp_path, CONFIG)
+
+
+def test_an_xmp_file_of_a_photo_program_is_none_of_cameras(tmp_path: Path) -> None:
+    pictures(tmp_path, ["0.png", "1.png"])
+    (tmp_path / "0.xmp").write_text('<x:xmpmeta xmlns:x="adobe:ns:meta/"/>')
+    assert find_source(tmp_path) == "photos"
+
+
+@pytest.mark.parametrize("undistorted", [True, False])
+def test_scenes_of_eth3d(tmp_path: Path, undistorted: bool) -> None:
+    values = eth3d(tmp_path, undistorted=undistorted, depth=True)
+    assert find_source(tmp_path) == "colmap"
+    capture = read_capture(tmp_path, CONFIG)
+    assert capture.metric
+    for k, shot in enumerate(capture.shots):
+        assert shot.world_from_cam is not None
+        assert shot.lens is not None
+        np.testing.assert_allclose(shot.world_from_cam, pose(k), atol=1e-9)
+        assert shot.lens.bends is not undistorted
+        assert (shot.depth is None) is undistorted, "depth belongs to the pictures as they were taken"
+        if shot.depth is not None:
+            np.testing.assert_array_equal(shot.depth.read(SIZE), np.where(np.isinf(values), 0, values))
+    assert any("belongs to the distorted pictures" in note for note in capture.notes) is undistorted
+    known = load_photos(tmp_path, ROUNDS, CONFIG).known
+    assert known is not None
+    assert known.metric
+    if not undistorted:
+        assert known.depth is not None
+        seen = known.depth[known.depth > 0]
+        assert len(seen) > 0.2 * known.depth.numel()
+        assert 1 <= float(seen.min()) < float(seen.max()) <= 3, "metres, and no infinity"
+    with pytest.raises(UserError, match="raw float32 depth map"):
+        load_photos(tmp_path / "ground_truth_depth" / "dslr_images", ROUNDS, CONFIG)
 
 
 @pytest.mark.parametrize("quarter_turn", [False, True])

@@ -102,6 +102,17 @@ def test_foreign_files_open(tmp_path: Path, layout: str, sh_coefficients: int, e
     assert (again.source_view == -1).all()
 
 
+@pytest.mark.parametrize("rgb", [False, True])
+def test_more_rows_than_are_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rgb: bool) -> None:
+    scene = random_gaussians(7, sh_coefficients=16)
+    write_ply(scene, tmp_path / "scene.ply", rgb=rgb)
+    monkeypatch.setattr("sceneexpander.splatting.ply.ROWS_PER_READ", 3)
+    again = read_ply(tmp_path / "scene.ply")
+    assert_same_scene(again, scene)
+    assert torch.equal(again.source_view, scene.source_view)
+    assert torch.equal(again.generated, scene.generated)
+
+
 def test_other_elements_and_windows_line_ends_are_skipped(tmp_path: Path) -> None:
     scene = random_gaussians(2, sh_coefficients=1)
     foreign_file(tmp_path / "a.ply", scene, LAYOUTS["gsplat"], "binary_little_endian")

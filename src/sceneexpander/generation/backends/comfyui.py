@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import json
+import logging
 import re
 import time
 from collections.abc import Mapping
@@ -23,6 +24,7 @@ from sceneexpander.plainfiles import read_plain_file
 from sceneexpander.ranges import Range
 from sceneexpander.services.transport import ServiceError, http_error, retry_after_s
 
+logger = logging.getLogger(__name__)
 _LARGEST_WORKFLOW = 16 * 2**20
 _TEXTS, _SEEDS = ("text", "prompt", "value", "string"), ("seed", "noise_seed", "value")
 _POLL_S = 0.5
@@ -103,7 +105,8 @@ class ComfyUIService:
         return Reply(data=response.content, model="ComfyUI workflow", request_id=run, parameters={"seed": str(seed)})
 
     def _finished(self, run: str, workflow: Workflow, deadline: float) -> dict[str, str]:
-        """Where the run's picture lies on the server, once it is there."""
+        """Where the run's picture lies on the server, once it is there. What becomes of it until then is said."""
+        shown = ""
         while True:
             entry = self._json("GET", f"/history/{run}").get(run)
             status = entry.get("status", {}) if isinstance(entry, dict) else {}
@@ -117,7 +120,32 @@ class ComfyUIService:
             if time.monotonic() > deadline:
                 fix = "raise generator.timeout_s, or look at the server"
                 raise ServiceError("failed_final", f"not finished within {self.config.timeout_s:g} s", fix=fix)
+            words = self._progress(run)
+            if words and words != shown:
+                logger.info("ComfyUI: %s", words)
+                shown = words
             time.sleep(_POLL_S)
+
+    def _progress(self, run: str) -> str:
+        """Where a run stands in the server's queue, in words; empty if the server does not say."""
+        try:
+            queue = self._json("GET", "/queue")
+        except ServiceError:  # it is only for people: the run may go on all the same
+            return ""
+        numbers: dict[str, list[tuple[float, str]]] = {}
+        for key in ("queue_running", "queue_pending"):
+            entries = queue.get(key)
+            rows = (
+                [row for row in entries if isinstance(row, list) and len(row) > 1] if isinstance(entries, list) else []
+            )
+            numbers[key] = [(row[0], str(row[1])) for row in rows if isinstance(row[0], (int, float))]
+        if any(name == run for _, name in numbers["queue_running"]):
+            return "the workflow is running"
+        own = next((number for number, name in numbers["queue_pending"] if name == run), None)
+        if own is None:
+            return ""
+        before = len(numbers["queue_running"]) + sum(number < own for number, _ in numbers["queue_pending"])
+        return f"the workflow waits, {before} before it"
 
     def _json(self, method: str, path: str, **arguments: Any) -> dict[str, Any]:
         try:

@@ -9,12 +9,14 @@ from pathlib import Path
 
 from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.ingest.config import IngestConfig
+from sceneexpander.ingest.formats import kind_of_file, name_of_content, read_head
 from sceneexpander.ingest.sources.camera_files import CameraParams, CameraTexts, SevenScenes
 from sceneexpander.ingest.sources.capture import Capture, Shot, Source
 from sceneexpander.ingest.sources.colmap import ColmapModel
 from sceneexpander.ingest.sources.metashape import MetashapeCameras
 from sceneexpander.ingest.sources.photos import PhotoFolder
 from sceneexpander.ingest.sources.posed import PosedPhotos
+from sceneexpander.ingest.sources.reality_capture import RealityCaptureXmp
 from sceneexpander.ingest.sources.transforms import Transforms
 from sceneexpander.ingest.sources.video import Video
 
@@ -28,6 +30,7 @@ SOURCES: dict[str, Source] = {
     "camera_texts": CameraTexts(),
     "camera_params": CameraParams(),
     "metashape": MetashapeCameras(),
+    "reality_capture": RealityCaptureXmp(),
     "video": Video(),
     "photos": PhotoFolder(),
 }
@@ -51,9 +54,19 @@ def find_source(place: Path, name: str = AUTO, *, where: str | Path = "source") 
         return name
     found = next((known for known, source in SOURCES.items() if source.detect(place)), None)
     if found is None:
+        archive = _archive_words(place)
+        if archive:
+            fix = "unpack it and give the folder; 'sceneexpander expand' takes ZIP archives"
+            raise UserError(f"is {archive}", where=place, fix=fix)
         kinds = ", ".join(source.title for source in SOURCES.values())
         raise UserError("is no capture that can be read", where=place, fix=f"give one of: {kinds}")
     return found
+
+
+def _archive_words(place: Path) -> str:
+    """What to call a file that is an archive; empty for others."""
+    words = name_of_content(read_head(place)) or kind_of_file(place.suffix[1:].casefold())
+    return words if words.endswith("archive") else ""
 
 
 def read_capture(place: Path, config: IngestConfig, name: str = AUTO, *, where: str | Path = "source") -> Capture:

@@ -16,12 +16,11 @@ from PIL import Image
 
 from sceneexpander.errors import UserError
 from sceneexpander.ingest.config import IngestConfig
-from sceneexpander.ingest.formats import name_of_content
+from sceneexpander.ingest.formats import name_of_content, read_head
 from sceneexpander.ingest.samples import Pixels
 from sceneexpander.ingest.sources.capture import Capture, Shot
 from sceneexpander.plainfiles import require_plain_file
 
-_HEAD_BYTES = 64
 _ENDINGS = frozenset(
     {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp", ".flv"}
 )
@@ -42,12 +41,7 @@ class Video:
         """Whether the name or the first bytes say so."""
         if not place.is_file():
             return False
-        try:
-            with place.open("rb") as file:
-                head = file.read(_HEAD_BYTES)
-        except OSError:
-            return False
-        return place.suffix.casefold() in _ENDINGS or name_of_content(head) == "a video"
+        return place.suffix.casefold() in _ENDINGS or name_of_content(read_head(place)) == "a video"
 
     def read(self, place: Path, config: IngestConfig) -> Capture:
         """The chosen frames, as PNG files in memory."""
