@@ -44,6 +44,7 @@ ROOMS: dict[str, set[str]] = {
         "expansion",
         "frontend",
         "geometry",
+        "ingest",
         "insertion",
         "photometric",
         "reconstruction",
