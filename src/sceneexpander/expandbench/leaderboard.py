@@ -119,13 +119,13 @@ def measure_methods(
             cameras determine no similarity, is a `CaseScore` with a problem.
     """
     manifest = read_manifest(folder)
+    shrink = _check_cases(folder, manifest, scenes, grades)
     for name, place in results.items():
         require_folder(place, where=f"{name}={place}", expected="a folder SCENE/GRADE of results")
         if not any((place / scene).is_dir() for scene in scenes):
             raise UserError(
                 "holds none of the scenes", where=place, fix=f"expected {place / scenes[0] / grades[0]} ..."
             )
-    shrink = _check_cases(folder, manifest, scenes, grades)
     cases: list[CaseScore] = []
     for scene in scenes:
         truth = load_truth(folder, scene)
@@ -319,16 +319,19 @@ def table(board: Board, split: str, grade: str, metrics: Sequence[Metric]) -> Ta
 
 
 def missing_lines(board: Board) -> list[str]:
-    """A line for every case without numbers, and for numbers that a method has in some of its cases only."""
+    """A line for every case without numbers, for numbers that a method has in some of its cases only, and for those it has nowhere."""
     lines = [f"{case.method}: {case.scene}, {case.grade}: {case.problem}" for case in board.cases if case.problem]
     for method in board.methods:
         scored = [case for case in board.cases if case.method == method and not case.problem]
+        nowhere = []
         for metric in METRICS:
             without = [f"{case.scene}, {case.grade}" for case in scored if metric.name not in case.values]
             if without and len(without) < len(scored):
                 lines.append(f"{method}: no {metric.title} in {'; '.join(without)}")
             elif without:
-                lines.append(f"{method}: no {metric.title}")
+                nowhere.append(metric.title)
+        if nowhere:
+            lines.append(f"{method}: nowhere {'; '.join(nowhere)}")
     return lines
 
 

@@ -28,6 +28,7 @@ from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting.ply import write_ply
 
 NAME, GRADE, SHRINK = "courtyard_1", "clean", 4
+CASE = ("--scenes", NAME, "--grades", GRADE)
 # Another frame and scale than the truth's.
 ELSEWHERE = Similarity(
     scale=0.37,
@@ -338,8 +339,8 @@ def test_what_cannot_be_scored_is_one_line_and_exit_code_2(
     [
         (["leaderboard", "{bench}"], "no method is given"),
         (["leaderboard", "{bench}", "--results", "theirs"], "is not NAME=FOLDER"),
-        (["leaderboard", "{bench}", "--results", "theirs={bench}/nowhere", "--scenes", NAME], "does not exist"),
-        (["leaderboard", "{bench}", "--results", "theirs=/tmp", "--scenes", NAME], "holds none of the scenes"),
+        (["leaderboard", "{bench}", "--results", "theirs={bench}/nowhere", *CASE], "does not exist"),
+        (["leaderboard", "{bench}", "--results", "theirs={bench}/courtyard_1", *CASE], "holds none of the scenes"),
         (["leaderboard", "{bench}", "--results", "a={bench}"], "holds no test scene"),
         (["leaderboard", "{bench}", "--results", "a={bench}", "--scenes", "room_2"], "holds no scene room_2"),
         (["leaderboard", "{bench}", "--results", "a={bench}", "--scenes", NAME, "--grades", "zoom_5"], "zoom_5"),
@@ -372,7 +373,9 @@ def test_one_command_makes_the_table_of_what_was_handed_in(
     shown = capsys.readouterr().out
     assert "for trying things out only" in shown
     assert "| whole | 1/1 | 100 | 0.00 |" in shown
-    assert "- posed: no PSNR, expanded, held out" in shown
+    (nowhere,) = [line for line in shown.splitlines() if line.startswith("- posed: nowhere ")]
+    assert "PSNR, expanded, held out" in nowhere
+    assert "rotation" not in nowhere
     saved = json.loads((tmp_path / "out" / "leaderboard.json").read_text())
     assert saved["content"]
     assert saved["version"]
