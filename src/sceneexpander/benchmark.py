@@ -182,7 +182,7 @@ def _rows(given: argparse.Namespace, *, shrink: int) -> Rows:
     from sceneexpander.expandbench.leaderboard import Rows, own_rows
     from sceneexpander.expandbench.run import Settings
     from sceneexpander.expandbench.scenes import DEVELOPMENT
-    from sceneexpander.project import find_project
+    from sceneexpander.pipeline.project import find_project
 
     project, names = find_project(), _split(given.rows)
     seed = given.seed or 0

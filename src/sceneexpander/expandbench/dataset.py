@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sceneexpander.artifacts.store import (
-    directory_being_written,
     read_json,
     read_typed,
     sha256_of_bytes,
@@ -58,6 +57,7 @@ from sceneexpander.expandbench.scenes import (
     bench_scene,
     draw_scene,
 )
+from sceneexpander.files import directory_being_written
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.ingest.decode import read_picture
 from sceneexpander.synthetic.bundled import unseen_by

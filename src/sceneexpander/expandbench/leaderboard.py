@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sceneexpander.artifacts.store import read_json, to_plain, write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import read_json, to_plain, write_json_atomic
 from sceneexpander.catalogue import Metric, Table
 from sceneexpander.catalogue.metrics import DASH
 from sceneexpander.errors import UserError
@@ -30,6 +30,7 @@ from sceneexpander.expandbench.run import BASELINE, CAPTURED, Settings, make_sce
 from sceneexpander.expandbench.scenes import VIEWS
 from sceneexpander.expandbench.score import GEOMETRY, METRICS, RENDERING, align_entry, score
 from sceneexpander.expansion import MethodConfig
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.plainfiles import require_folder
 
 SCHEMA = "leaderboard/1"

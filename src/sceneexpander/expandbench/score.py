@@ -33,6 +33,7 @@ from sceneexpander.expandbench.dataset import (
 from sceneexpander.expandbench.entries import Entry
 from sceneexpander.expandbench.scenes import CAPTURED, VIEWS
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.geometry.similarity import Similarity, align_poses
@@ -146,7 +147,7 @@ def _look(entry: Entry, truth: TrueScene, truth_from_entry: Similarity) -> dict[
     looks = {}
     for name, view in truth.views.items():
         pose = entry_from_truth.poses(view.world_from_cam[None]).float()
-        seen = render(entry.gaussians, pose, view.intrinsics_px[None].float(), *view.depth.shape)
+        seen = render(entry.gaussians, Cameras(pose, view.intrinsics_px[None].float(), *view.depth.shape))
         depth = torch.where(seen.alpha[0] > COVERED, seen.depth[0] * truth_from_entry.scale, 0.0)
         looks[name] = _Look(picture=seen.rgb[0].clamp(0, 1), depth=depth)
     return looks
