@@ -378,8 +378,8 @@ def _view_set(pictures: list[Tensor], ids: list[str], *, generated: bool) -> Vie
         ViewRecord(
             view_id=view_id,
             name=f"{view_id}.png",
-            original_height=HEIGHT * DETAIL,
-            original_width=WIDTH * DETAIL,
+            original_height=picture.shape[1],
+            original_width=picture.shape[2],
             sha256=hashlib.sha256(to_uint8(picture).tobytes()).hexdigest(),
             stored_from_original=((1 / DETAIL, 0.0, 0.0), (0.0, 1 / DETAIL, 0.0)),
             generated=generated,

@@ -26,7 +26,15 @@ from sceneexpander.expandbench.dataset import (
     read_manifest,
     scenes_named,
 )
-from sceneexpander.expandbench.scenes import ABLATION_TEST, DEVELOPMENT, SCENES, TEST, DrawnScene, draw_scene
+from sceneexpander.expandbench.scenes import (
+    ABLATION_TEST,
+    DEVELOPMENT,
+    SCENES,
+    TEST,
+    DrawnScene,
+    bench_scene,
+    draw_scene,
+)
 from sceneexpander.geometry.rigid import transform_points
 from sceneexpander.synthetic.render import trace_rays
 from sceneexpander.synthetic.scenes import KINDS
@@ -111,6 +119,20 @@ def test_depth_normals_poses_and_pictures_are_of_one_world(truth: TrueScene, dra
         solid = view.depth > 0
         assert torch.equal(~solid, view.seen == Seen.NOTHING)
         torch.testing.assert_close(view.normals[solid].norm(dim=-1), torch.ones(int(solid.sum())), rtol=2e-3, atol=0)
+
+
+def test_a_shrunk_scene_is_the_same_one_in_fewer_pixels(drawn: DrawnScene) -> None:
+    """What methods are told of its pictures' size goes with its intrinsics."""
+    scene = bench_scene(drawn)
+    assert scene.captured.detail_images is not None
+    height, width = scene.captured.detail_images.shape[-2:]
+    assert (height, width) == (84, 112)
+    for record in (*scene.captured.records, *scene.insert(PICTURED["clean"].misalignment)[0].records):
+        assert (record.original_height, record.original_width) == (height, width)
+        if record.sha256 in scene.captured_truth:
+            intrinsics = scene.captured_truth[record.sha256].intrinsics_px
+            assert intrinsics[:2, 2].tolist() == [width / 2, height / 2]
+    assert scene.intended.image.shape[1:] == scene.captured.images.shape[2:]
 
 
 def test_no_photograph_shows_the_expanded_region(bench: Path, drawn: DrawnScene) -> None:
