@@ -27,7 +27,7 @@ from sceneexpander.expandbench.grades import GRADES, grade_named
 from sceneexpander.expandbench.plot import plot
 from sceneexpander.expandbench.report import report
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings, run
-from sceneexpander.expandbench.scenes import DEVELOPMENT, SCENES, TEST
+from sceneexpander.expandbench.scenes import ABLATION_TEST, DEVELOPMENT, SCENES
 from sceneexpander.expandbench.studies import BEYOND, CONTROLS, STUDIES, TABLE, Study
 from sceneexpander.expansion import MethodConfig
 from sceneexpander.files import write_bytes_atomic
@@ -36,7 +36,7 @@ from sceneexpander.pipeline.fingerprint import SourceTree
 from sceneexpander.pipeline.project import find_project
 
 GRADES_BY_DEFAULT = ("mixed_2",)
-SPLITS = {"development": DEVELOPMENT, "test": TEST}
+SPLITS = {"development": DEVELOPMENT, "test": ABLATION_TEST}
 OWN_TABLE = ("scenes", "grades", "rows", "seeds")
 
 
@@ -60,7 +60,7 @@ def make_parser() -> CommandParser:
     )
     own = parser.add_argument_group("a table of your own instead of the studies")
     for name, known in (
-        ("scenes", f" of {', '.join(SCENES)}, or development, or test; default: development"),
+        ("scenes", f" of {', '.join(SCENES)}, or development, or test (eight of them); default: development"),
         ("grades", f" of {', '.join(GRADES)}; default: mixed_2"),
         ("rows", "; default: all"),
         ("seeds", "; default: 0,1,2"),
@@ -115,10 +115,10 @@ def _composed(project: Path, overrides: Sequence[str], experiment: str = "expand
     return parse_dataclass(ProjectConfig, values)
 
 
-def code_of(project: Path) -> str:
+def code_of(project: Path, module: str = "sceneexpander.expandbench.run") -> str:
     """What determines a cell beside its configuration: the code of the benchmark, all it imports, and the environment."""
     tree = SourceTree(packages={"sceneexpander": project / "src" / "sceneexpander"})
-    return find_environment(project).identify(tree, "sceneexpander.expandbench.run")
+    return find_environment(project).identify(tree, module)
 
 
 @entry_point

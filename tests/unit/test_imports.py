@@ -45,6 +45,7 @@ ROOMS: dict[str, set[str]] = {
         "expansion",
         "frontend",
         "geometry",
+        "ingest",
         "insertion",
         "photometric",
         "reconstruction",

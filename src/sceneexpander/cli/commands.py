@@ -25,6 +25,11 @@ COMMANDS = (
     Command("run", "sceneexpander.pipeline.plain", "bring the project's pipeline up to date without DVC"),
     Command("sweep", "sceneexpander.sweep", "run the pipeline for many combinations of settings"),
     Command("ablation", "sceneexpander.ablation", "measure what each part of the method does, against known truth"),
+    Command(
+        "expandbench",
+        "sceneexpander.benchmark",
+        "score expansions of any program on worlds whose truth is known exactly",
+    ),
     Command("plan", "sceneexpander.plan", "tell memory and operations in advance, without a GPU or weights"),
     Command("judge", "sceneexpander.judge_run", "have a vision-language model judge finished scenes"),
     Command("view", "sceneexpander.viewer.__main__", "walk through a reconstructed scene in the browser"),

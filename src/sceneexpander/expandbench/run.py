@@ -7,7 +7,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -20,9 +20,10 @@ from sceneexpander.artifacts.store import keep_newest, read_json, to_plain, writ
 from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.measure import BenchNumbers, measure
 from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
-from sceneexpander.expandbench.scenes import BenchScene, build_scene
+from sceneexpander.expandbench.scenes import BenchScene, bench_scene, draw_scene
 from sceneexpander.expansion import (
     Adapted,
+    Expanded,
     LoadedModel,
     MethodConfig,
     ModelConfig,
@@ -58,6 +59,7 @@ class Settings:
     any_code: bool = False
     threads: int = 1
     finished_only: bool = False  # nothing is run: cells that are not there are left out
+    shrink: int = 1  # see `draw_scene`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,12 +141,25 @@ def _scene_results(name: str, plan: Plan, settings: Settings) -> list[CellResult
     return list(_scene_cells(name, plan, settings))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Made:
+    """A row's reconstruction and how it came about; ``expanded`` where the weights were adapted or the view corrected."""
+
+    reconstruction: Reconstruction
+    case: PreparedCase | None = None
+    steps: int = 0
+    seconds: float = 0.0
+    expanded: tuple[Adapted, Expanded] | None = None
+
+
 class _Worker:
     """One scene's cells; models and prepared inputs are made only when a cell is not in the cache."""
 
     def __init__(self, name: str, settings: Settings) -> None:
         self.name, self.settings = name, settings
         before = {name: to_plain(getattr(settings, name)) for name in ("model", "frontend", "warmup")}
+        if settings.shrink != 1:
+            before["shrink"] = settings.shrink
         self.shared = json.dumps(before | {"refine": to_plain(settings.refine)}, sort_keys=True)
         # What the fit starts from is the same whatever the fit.
         code = "" if settings.any_code else settings.code
@@ -190,43 +205,54 @@ class _Worker:
     def _measured(
         self, grade: str, row: str, seed: int, config: MethodConfig | None, checkpoints: Path | None = None
     ) -> CellResult:
-        torch.set_num_threads(self.settings.threads)
+        made = self.make(grade, row, seed, config, checkpoints)
         alone: BenchNumbers | None = None
-        seconds, steps = 0.0, 0
-        fit = self.settings.refine
-        if row == CAPTURED:
-            case, before = None, self.prepared
-            reconstruction, _ = fit_to_views(before.captured, before.state.views, fit, seed=seed)
-        else:
-            case = self.case(grade)
-            if config is None:
-                views = case.inputs.state.views.append(case.inputs.inserted.view)
-                reconstruction, _ = fit_to_views(case.backbone, views, fit, seed=seed)
-            else:
-                procedure = compose_procedure(config, fit)
-                adapted, seconds = self._adapted(
-                    grade, case, procedure, seed, checkpoints if config.adapt.checkpoint_every else None
-                )
-                steps = len(adapted.result.records)
-                started = time.perf_counter()
-                expanded = procedure.finish(adapted, self.loaded, seed=seed)
-                reconstruction = expanded.scene
-                seconds += time.perf_counter() - started
-                start = adapted.inputs.state
-                without = reconstruct(start.views, start.priors, self.loaded, expanded.state.weights, method="alone")
-                without, _ = fit_to_views(without, start.views, fit, seed=seed)
-                alone = self._numbers(without, None)
+        if made.expanded is not None:
+            start = made.expanded[0].inputs.state
+            weights = made.expanded[1].state.weights
+            without = reconstruct(start.views, start.priors, self.loaded, weights, method="alone")
+            without, _ = fit_to_views(without, start.views, self.settings.refine, seed=seed)
+            alone = self._numbers(without, None)
         return CellResult(
             scene=self.name,
             grade=grade,
             row=row,
             seed=seed,
-            steps=steps,
-            seconds=seconds,
+            steps=made.steps,
+            seconds=made.seconds,
             code=self.settings.code,
-            numbers=self._numbers(reconstruction, case),
+            numbers=self._numbers(made.reconstruction, made.case),
             alone=alone,
-            candidate=judge_round(case.inputs) if case is not None and row == BASELINE else None,
+            candidate=judge_round(made.case.inputs) if made.case is not None and row == BASELINE else None,
+        )
+
+    def make(
+        self, grade: str, row: str, seed: int, config: MethodConfig | None, checkpoints: Path | None = None
+    ) -> _Made:
+        """What a row makes of the scene: `CAPTURED` and `BASELINE` have no configuration."""
+        torch.set_num_threads(self.settings.threads)
+        fit = self.settings.refine
+        if row == CAPTURED:
+            before = self.prepared
+            reconstruction, _ = fit_to_views(before.captured, before.state.views, fit, seed=seed)
+            return _Made(reconstruction=reconstruction)
+        case = self.case(grade)
+        if config is None:
+            views = case.inputs.state.views.append(case.inputs.inserted.view)
+            reconstruction, _ = fit_to_views(case.backbone, views, fit, seed=seed)
+            return _Made(reconstruction=reconstruction, case=case)
+        procedure = compose_procedure(config, fit)
+        adapted, seconds = self._adapted(
+            grade, case, procedure, seed, checkpoints if config.adapt.checkpoint_every else None
+        )
+        started = time.perf_counter()
+        expanded = procedure.finish(adapted, self.loaded, seed=seed)
+        return _Made(
+            reconstruction=expanded.scene,
+            case=case,
+            steps=len(adapted.result.records),
+            seconds=seconds + time.perf_counter() - started,
+            expanded=(adapted, expanded),
         )
 
     def _adapted(
@@ -251,7 +277,7 @@ class _Worker:
     def scene(self) -> BenchScene:
         """The scene, rendered at the first call."""
         if self._scene is None:
-            self._scene = build_scene(self.name)
+            self._scene = bench_scene(draw_scene(self.name, shrink=self.settings.shrink))
         return self._scene
 
     @property
@@ -287,3 +313,12 @@ def _scene_cells(name: str, plan: Plan, settings: Settings) -> Iterator[CellResu
         result = worker.cell(*cell)
         if result is not None:
             yield result
+
+
+def make_scenes(
+    name: str, wanted: Sequence[tuple[str, str, MethodConfig | None]], seed: int, settings: Settings
+) -> Iterator[Reconstruction]:
+    """Reconstructions of a scene by grade, row and the row's configuration (None for `CAPTURED` and `BASELINE`), one after the other."""
+    worker = _Worker(name, settings)
+    for grade, row, config in wanted:
+        yield worker.make(grade, row, seed, config).reconstruction

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.expandbench.run import BASELINE
-from sceneexpander.expandbench.scenes import DEVELOPMENT, TEST
+from sceneexpander.expandbench.scenes import ABLATION_TEST, DEVELOPMENT
 
 TABLE = ("anchor", "subset_aug", "self_distill", "self_distill_p1", "paper")  # the paper's, after the baseline
 BEYOND = (
@@ -136,7 +136,7 @@ STUDIES = (
         name="test",
         title="Test scenes",
         meaning="Scenes that nothing was chosen on, measured once for this version; with the fit.",
-        scenes=TEST,
+        scenes=ABLATION_TEST,
         grades=("clean", "mixed_2"),
         rows=("paper", "corrected", "default"),
         seeds=(0, 1, 2),

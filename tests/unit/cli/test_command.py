@@ -122,6 +122,7 @@ def test_bash_completes_commands_and_options(tmp_path: Path, words: list[str], e
     "module",
     [
         "ablation",
+        "benchmark",
         "conformance",
         "convert_checkpoint",
         "expand",

@@ -14,7 +14,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.expandbench.document import READING, Measured, Results, document, powerless, written
 from sceneexpander.expandbench.grades import GRADES
 from sceneexpander.expandbench.run import BASELINE, CAPTURED
-from sceneexpander.expandbench.scenes import DEVELOPMENT, SCENES, TEST
+from sceneexpander.expandbench.scenes import ABLATION_TEST, DEVELOPMENT, SCENES, TEST
 from sceneexpander.expandbench.studies import STUDIES
 from sceneexpander.insertion.contradiction import Contradiction
 from tests.support.methods import make_method
@@ -126,4 +126,4 @@ def test_an_old_name_says_the_new_one() -> None:
     with pytest.raises(UserError, match="ablation=corrected"):
         make_plan(ROOT, ["control_no_adaptation"], ["room_1"], ["clean"], ["0"], [])
     plan, _ = make_plan(ROOT, ["default"], ["test"], ["clean"], ["0"], [])
-    assert plan.scenes == TEST
+    assert plan.scenes == ABLATION_TEST
