@@ -49,7 +49,7 @@ ROOMS: dict[str, set[str]] = {
         "reconstruction",
         "splatting",
     },
-    "evaluation": {"artifacts", "catalogue", "geometry", "splatting"},
+    "evaluation": {"artifacts", "catalogue", "frontend", "geometry", "splatting"},
     "expandbench": {
         "adaptation",
         "artifacts",

@@ -15,6 +15,7 @@ from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.measure import Measure, Navigation, Subject, Values, known_values
 from sceneexpander.evaluation.sizes import AtOtherSizes
+from sceneexpander.evaluation.tour import TourConsistency
 from sceneexpander.evaluation.truth import SceneTruth, TruthMetrics, against_truth
 from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverage, measure_views
 
@@ -43,7 +44,15 @@ class AgainstTruth(Measure):
         return {metric.name: getattr(found, metric.name) for metric in self.metrics}
 
 
-MEASURES: list[Measure] = [AtStoredSize(), FromOthers(), AtOtherSizes(), TourCoverage(), AgainstTruth(), Counts()]
+MEASURES: list[Measure] = [
+    AtStoredSize(),
+    FromOthers(),
+    AtOtherSizes(),
+    TourCoverage(),
+    TourConsistency(),
+    AgainstTruth(),
+    Counts(),
+]
 
 
 def register_measure(measure: Measure) -> None:

@@ -153,6 +153,16 @@ def test_sizes_must_agree() -> None:
         preservation(scene, smaller, CONFIG)
 
 
+def test_a_render_that_is_not_finite_is_refused_by_the_views_name() -> None:
+    scene = made_reconstruction()
+    views = own_pictures(scene)
+    sh = scene.gaussians.sh.clone()
+    sh[scene.gaussians.source_view == 1] = float("nan")
+    broken = dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, sh=sh))
+    with pytest.raises(UserError, match=r"shows view '00[01]' with values that are not finite"):
+        preservation(broken, views, CONFIG)
+
+
 def test_row_holds_everything_and_survives_the_disk(tmp_path: Path) -> None:
     scene = made_reconstruction()
     navigation = Navigation(
@@ -164,6 +174,12 @@ def test_row_holds_everything_and_survives_the_disk(tmp_path: Path) -> None:
     assert row.value("gaussians_generated") == HEIGHT * WIDTH
     assert row.value("psnr_inserted_db") == PSNR_CAP_DB
     assert row.value("depth_abs_rel") is None
+    assert row.value("tour_registered") is not None
+    unmeasured = dataclasses.replace(CONFIG, consistency_frames=0)
+    without = evaluate(
+        scene, own_pictures(scene), unmeasured, scene="made", round_number=1, seed=0, navigation=navigation
+    )
+    assert without.value("tour_registered") is None
     assert row.numbers()["psnr_captured_db"] == PSNR_CAP_DB
     assert set(row.values) <= {metric.name for metric in measured_metrics()}
     assert "torch" in row.versions
