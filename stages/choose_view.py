@@ -9,10 +9,12 @@ from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.views import save_png
 from sceneexpander.config.files import read_sections
 from sceneexpander.generation import ChoiceConfig, choose_view
+from sceneexpander.judge import JudgeConfig, make_judge
+from sceneexpander.project import JUDGED_FOLDER
 from stages import layout
 from stages.machine import use_machine
 from stages.rounds import generation_context, scene_so_far
-from stages.runner import Cell, stage
+from stages.runner import Cell, project_root, stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,20 +24,28 @@ class Sections:
     seed: int
     threads: int
     choose: ChoiceConfig
+    judge: JudgeConfig
 
 
 @stage("scene", "round", "previous")
 def main(cell: Cell) -> None:
-    """Check, rank, choose; the contact sheet shows all candidates."""
+    """Check, rank, choose; the contact sheet shows all candidates, the overlay how the chosen one goes with the scene."""
     sections = read_sections(layout.config(cell.scene), Sections)
     use_machine(sections.threads)
     made = CandidateSet.load(layout.candidates(cell.scene, cell.round))
     chosen = choose_view(
-        generation_context(cell), made.candidates, scene_so_far(cell), sections.choose, seed=sections.seed
+        generation_context(cell),
+        made.candidates,
+        scene_so_far(cell),
+        sections.choose,
+        seed=sections.seed,
+        judge=make_judge(sections.judge, project_root() / JUDGED_FOLDER),
     )
     with directory_being_written(layout.inserted(cell.scene, cell.round)) as folder:
         chosen.inserted.save(folder)
         save_png(folder / "sheet.png", chosen.sheet)
+        if chosen.overlay is not None:
+            save_png(folder / "overlay.png", chosen.overlay)
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ def _round(scene: str, number: int, methods: Sequence[str]) -> RoundSource:
         log=layout.state(scene, number) / "log.json",
         statistics=layout.round_folder(scene, number) / "stats",
         cameras=layout.cameras(layout.joint_priors(scene, number)),
+        judged=layout.judged(scene, number),
     )
 
 

@@ -37,7 +37,8 @@ def selection(scene: str) -> Path:
 def given(scene: str, kind: str) -> Path:
     """A folder of links to files that the configuration names, wherever they are: the pipeline depends on their bytes.
 
-    ``kind``: ``generator`` and ``choice`` (a link per round), ``model`` (weights), or a rival's name (weights).
+    ``kind``: ``generator`` and ``choice`` (a link per round), ``judge`` (a prompt per criterion), ``model`` (weights), or a rival's name
+    (weights).
     """
     return GIVEN / scene / kind
 
@@ -55,6 +56,11 @@ def round_folder(scene: str, number: int) -> Path:
 def state(scene: str, number: int) -> Path:
     """The `ExpansionState` after a round."""
     return round_folder(scene, number) / MAIN
+
+
+def match_memory(scene: str) -> Path:
+    """The `MatchMemory` of the captured views; empty for models that need no cameras."""
+    return round_folder(scene, 0) / "matches"
 
 
 def reconstruction(scene: str, number: int, method: str) -> Path:
@@ -110,6 +116,11 @@ def packed(scene: str, number: int, method: str) -> Path:
 def metrics(scene: str, number: int, method: str) -> Path:
     """Metrics of a method's reconstruction."""
     return round_folder(scene, number) / "metrics" / f"{method}.json"
+
+
+def judged(scene: str, number: int) -> Path:
+    """The `JudgedRound` of a round."""
+    return round_folder(scene, number) / "judged"
 
 
 def statistics(stage: str, scene: str, number: int | None = None, method: str | None = None) -> Path:

@@ -24,7 +24,7 @@ class Sections:
 
 @stage("scene", "round", "method")
 def main(cell: Cell) -> None:
-    """Render videos, stills, every view, and the Gaussians as PLY."""
+    """Render videos, stills, every view, the Gaussians as PLY, and what else is asked for."""
     made = layout.reconstruction(cell.scene, cell.round, cell.method)
     if passed_on(made, layout.renders(cell.scene, cell.round, cell.method)):
         return
@@ -43,6 +43,12 @@ def main(cell: Cell) -> None:
         progress_bar(f"render {cell.scene} {cell.method}", sections.render.frames) as bar,
     ):
         produce_renders(reconstruction, reference, sections.render, folder, device=sections.device, on_frame=bar.update)
+        if sections.render.exports:
+            from sceneexpander.exports.scene import load_scene
+            from sceneexpander.exports.write import write_exports
+
+            scene = load_scene(layout.OUTPUTS / cell.scene, cell.round, cell.method)
+            write_exports(scene, sections.render.exports, folder / "exports")
 
 
 if __name__ == "__main__":

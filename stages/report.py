@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sceneexpander.artifacts.judgement import SCENE_CRITERIA, JudgedRound
 from sceneexpander.artifacts.metrics import MetricsRow, Row, load_row
 from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.table import comparison_table, scene_table
 from sceneexpander.report import write_page
+from sceneexpander.report.judged import comparisons_table, judged_table
 from sceneexpander.selection import read_selection
 from stages import layout
 from stages.runner import Cell, stage
@@ -21,14 +23,26 @@ def _digits(value: float) -> float:
     return float(f"{value:.5g}")
 
 
+def _judged_numbers(judged: JudgedRound, method: str) -> dict[str, float]:
+    """Means by criterion, of those that have one: a score that is missing is no number."""
+    scores = {criterion: judged.score(method, criterion) for criterion in SCENE_CRITERIA}
+    return {
+        f"judge_{criterion}": _digits(score.mean)
+        for criterion, score in scores.items()
+        if score is not None and score.mean is not None
+    }
+
+
 @stage()
 def main(_: Cell) -> None:
     """Page, tables, numbers; scenes, rounds and methods as params.yaml lists them."""
     selected = read_selection(Path())
     rows: list[Row] = []
+    judged: list[JudgedRound] = []
     numbers: dict[str, dict[str, dict[str, dict[str, float | str]]]] = {}
     for scene in selected.scenes:
         for number in range(1, selected.rounds + 1):
+            judged.append(JudgedRound.load(layout.PAGES / scene / f"round_{number}"))
             for method in selected.methods:
                 row = load_row(layout.PAGES / scene / f"round_{number}" / method / "metrics.json")
                 rows.append(row)
@@ -37,6 +51,7 @@ def main(_: Cell) -> None:
                     if isinstance(row, MetricsRow)
                     else {"unavailable": row.reason}
                 )
+                known |= _judged_numbers(judged[-1], method)
                 numbers.setdefault(scene, {}).setdefault(f"round_{number}", {})[method] = known
     if not rows:
         raise UserError("selects nothing to report", where="params.yaml", fix="name scenes, rounds and methods")
@@ -45,6 +60,10 @@ def main(_: Cell) -> None:
         for name, table in (("comparison", comparison_table(rows)), ("scenes", scene_table(rows))):
             for ending, text in (("md", table.markdown()), ("csv", table.csv()), ("tex", table.latex())):
                 write_bytes_atomic(folder / f"{name}.{ending}", text.encode())
+        scores, comparisons = judged_table(judged, selected.methods), comparisons_table(judged)
+        write_bytes_atomic(folder / "judged.csv", scores.csv().encode())
+        if comparisons is not None:
+            write_bytes_atomic(folder / "judged_pairs.csv", comparisons.csv().encode())
     write_json_atomic(RESULTS, numbers)
 
 

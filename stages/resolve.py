@@ -13,6 +13,7 @@ from sceneexpander.config.files import write_yaml
 from sceneexpander.config.overrides import written_out
 from sceneexpander.environment import usable_cpus
 from sceneexpander.generation.config import ChoiceConfig, GeneratorConfig
+from sceneexpander.judge.config import JudgeConfig
 from sceneexpander.models.weights import named_file
 from sceneexpander.selection import read_selection
 from sceneexpander.typed import decode_dataclass
@@ -39,10 +40,12 @@ def named_files(values: Mapping[str, Any], rounds: int) -> dict[str, dict[str, P
     """
     generator = decode_dataclass(GeneratorConfig, values["generator"])
     choice = decode_dataclass(ChoiceConfig, values["choose"])
+    judge = decode_dataclass(JudgeConfig, values["judge"])
     numbers = range(1, rounds + 1)
     found: dict[str, dict[str, Path | None]] = {
         "generator": {f"round_{number}": generator.named_file(number) for number in numbers},
         "choice": {f"round_{number}": choice.named_file(number) for number in numbers},
+        "judge": dict(judge.named_files()),
         "model": {"weights": named_file(values["model"]["weights"])},
     }
     for rival, section in values["rivals"].items():

@@ -16,8 +16,9 @@ from sceneexpander.evaluation.truth import check_truth
 from sceneexpander.generation import Forecast, GenerationContext, check_round
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import load_scene
+from sceneexpander.judge import make_judge
 from sceneexpander.models.weights import HUB_ID
-from sceneexpander.project import GENERATED_FOLDER, find_project
+from sceneexpander.project import GENERATED_FOLDER, JUDGED_FOLDER, find_project
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
 
 
@@ -42,6 +43,7 @@ CHECKED_SECTIONS = (
     "scene",
     "generator",
     "choose",
+    "judge",
     "model",
     "rivals",
 )  # of the configuration, beside the device
@@ -76,6 +78,9 @@ def check_scene(
     config = parse_dataclass(ProjectConfig, compose(conf, [f"scene={scene_option(conf, name)}", *overrides]))
     if device:
         check_device(config.device)
+    judge = make_judge(config.judge, find_project() / JUDGED_FOLDER)
+    if judge is not None:
+        judge.require()
     checked = Checked() if checked is None else checked
     pictures = folder, config.scene, repr(config.generator), config.choose, rounds
     if pictures not in checked.pictures:

@@ -14,6 +14,7 @@ ERROR_FILE_ENV = (
 SWEEP_ENV = "SCENEEXPANDER_SWEEP"  # set in the jobs of a sweep: its id, a tag of the recorded runs
 
 GENERATED_FOLDER = Path(".cache") / "generated"  # in the project folder: answers of image services, by what was asked
+JUDGED_FOLDER = Path(".cache") / "judged"  # in the project folder: answers of judges, by what was asked and shown
 LIVE_FOLDER = Path(".cache") / "live"  # in the project folder: logs of running adaptations
 
 

@@ -75,11 +75,12 @@ class Tiny:
             (folder / path).write_text(text)
         self.write(
             layout.config(SCENE),
-            dict.fromkeys(SECTIONS, 1) | {"evaluate": 1, "rivals": dict.fromkeys(methods_of(Kind.RIVAL), 1)},
+            dict.fromkeys(SECTIONS, 1)
+            | {"evaluate": 1, "judge": 1, "rivals": dict.fromkeys(methods_of(Kind.RIVAL), 1)},
         )
         self.write(layout.selection(SCENE), {method.name: True for method in METHODS if not method.always_made})
         self.write(layout.CODE, hashes(TREE, HERE))
-        for kind in ("generator", "choice", "model", *methods_of(Kind.RIVAL)):
+        for kind in ("generator", "choice", "judge", "model", *methods_of(Kind.RIVAL)):
             link_files({}, folder / layout.given(SCENE, kind))
         link_files({"round_1": folder / "away/picture.png"}, folder / layout.given(SCENE, "generator"))
         link_files({"round_1": folder / "away/chosen.png"}, folder / layout.given(SCENE, "choice"))
@@ -221,6 +222,7 @@ def test_a_configuration_names_its_files(tmp_path: Path, monkeypatch: pytest.Mon
     values = {
         "generator": {"backend": "file", "file": "p_{round}.png"},
         "choose": {"candidate": "auto", "fit": "crop"},
+        "judge": {"backend": "none"},
         "model": {"weights": "w.safetensors"},
         "rivals": {"omnivggt": {"weights": None}, "ttt3r": {"weights": "org/name@main"}},
     }

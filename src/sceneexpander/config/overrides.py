@@ -27,6 +27,8 @@ PATH_KEYS = frozenset(
         "generator.file",
         "generator.workflow",
         "choose.candidate",
+        "judge.insertion_prompt",
+        "judge.quality_prompt",
         *(f"rivals.{method.name}.weights" for method in METHODS if method.needs_weights),
     }
 )

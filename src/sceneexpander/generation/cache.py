@@ -6,7 +6,6 @@ The folder belongs to the project, not to a stage, so it outlives forced reruns,
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +19,9 @@ from sceneexpander.artifacts.store import (
     read_typed,
     save_artifact,
     sha256_of_bytes,
-    to_plain,
     write_bytes_atomic,
 )
+from sceneexpander.services.kept import digest_of
 
 SCHEMA = "answer/1"
 _PICTURE = "picture"
@@ -46,7 +45,7 @@ class AnswerCache:
     @classmethod
     def of(cls, root: Path, question: Mapping[str, object]) -> AnswerCache:
         """The part of the cache that belongs to a question: back-end, model, parameters, words."""
-        return cls(folder=root / _digest(question))
+        return cls(folder=root / digest_of(question))
 
     def count(self) -> int:
         """How many answers there are at least, whatever was shown."""
@@ -78,14 +77,10 @@ class AnswerCache:
 
     def _place(self, references: Mapping[str, str], number: int) -> Path:
         # Sorted: which of the same views comes first may hang on the last digit of an estimated camera.
-        return self.folder / _digest({"references": sorted(references.values()), "number": number})
+        return self.folder / digest_of({"references": sorted(references.values()), "number": number})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Facts:
     provenance: Provenance | None
     refused: str | None
-
-
-def _digest(content: Mapping[str, object]) -> str:
-    return sha256_of_bytes(json.dumps(to_plain(content), sort_keys=True).encode())[:32]

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 
-import numpy as np
-from PIL import Image
-
-from sceneexpander.artifacts.store import sha256_of_bytes
 from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.errors import UserError
 from sceneexpander.generation.motion import parse_motion
 from sceneexpander.generation.prompt import split_words
 from sceneexpander.generation.protocol import GenerationContext, SceneSoFar
 from sceneexpander.generation.start import CENTRAL, gaze_distance, moved_camera, start_view, view_distances
+from sceneexpander.services.pictures import encode_picture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,16 +53,10 @@ def _encoded(context: GenerationContext, views: ViewSet, index: int, long_side_p
     view_id, source = views.view_ids[index], views
     if view_id in context.captured.view_ids:
         source, index = context.captured, context.captured.view_ids.index(view_id)
-    photo = Image.fromarray(to_uint8(source.photo(index)))
-    scale = min(1.0, long_side_px / max(photo.size))
-    size = (max(1, round(photo.width * scale)), max(1, round(photo.height * scale)))
-    shown = photo if size == photo.size else photo.resize(size, Image.Resampling.LANCZOS)
-    buffer = io.BytesIO()
-    shown.save(buffer, format="PNG")
-    pixels = np.asarray(shown)
+    sent = encode_picture(to_uint8(source.photo(index)), long_side_px=long_side_px)
     return Reference(
         view_id=view_id,
-        png=buffer.getvalue(),
-        pixels_sha256=sha256_of_bytes(f"{pixels.shape}".encode() + pixels.tobytes()),
+        png=sent.png,
+        pixels_sha256=sent.pixels_sha256,
         record_sha256=source.records[index].sha256,
     )

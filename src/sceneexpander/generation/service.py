@@ -1,23 +1,15 @@
-"""What all image services have in common: the cache, the budget, what is tried again and what is not, and the record of each picture.
-
-Every request ends in one of four ways: a candidate; *refused* (the provider will not draw this: never asked again by itself); *failed,
-retryable* (asked again a few times, then given up); *failed, final* (nothing would come of asking again).
-"""
+"""What all image services have in common: the cache, and the record of each picture. How they are asked: `sceneexpander.services`."""
 
 from __future__ import annotations
 
 import logging
-import random
-import re
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from threading import Event, Thread
 from typing import Any, Protocol
 
-from sceneexpander.artifacts.candidates import Candidate, CandidateSet, Ending, Outcome
+from sceneexpander.artifacts.candidates import Candidate, CandidateSet, Outcome
 from sceneexpander.artifacts.inserted import Provenance
 from sceneexpander.artifacts.source_type import MADE_BY_MODEL
 from sceneexpander.artifacts.store import sha256_of_bytes, to_plain
@@ -28,33 +20,12 @@ from sceneexpander.generation.config import ServiceConfig
 from sceneexpander.generation.prompt import fill_prompt
 from sceneexpander.generation.protocol import Forecast, GenerationContext, SceneSoFar
 from sceneexpander.generation.references import Reference, choose_references
+from sceneexpander.generation.spending import SceneBudget, read_spent, spent_ledger
 from sceneexpander.ingest.decode import decode_picture
+from sceneexpander.services.transport import Budget, ServiceError, ask_patiently, safe_text
 
 logger = logging.getLogger(__name__)
 MAX_MEGAPIXELS = 40.0  # of an answer: no service is asked for as much
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 60.0  # between two tries, doubled each time
-_LONGEST_ASKED_WAIT_S = 300.0  # a service that wants more than that is as good as down
-_SIGN_OF_LIFE_S = 15.0
-_MAX_REASON = 300
-_KEY_SHAPED = re.compile(r"\b(?:sk|pk|key|AIza)[-_]?[A-Za-z0-9_*-]{6,}")
-
-
-class ServiceError(Exception):
-    """A request that made no picture.
-
-    Args:
-        ending: how it ends.
-        reason: the provider's own, in its words.
-        fix: what the user can do about it.
-        wait_s: how long the provider asks to wait before the next try; None: it does not say.
-    """
-
-    def __init__(self, ending: Ending, reason: str, *, fix: str = "", wait_s: float | None = None) -> None:
-        super().__init__(reason)
-        self.ending = ending
-        self.reason = reason
-        self.fix = fix
-        self.wait_s = wait_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,10 +83,11 @@ class ServiceGenerator:
         missing = max(0, self.config.candidates - self._cache(context).count())
         if missing:
             self.service.require()
-        price = self.config.price_usd
+        price, spent = self.config.price_usd, read_spent(spent_ledger(context))
         shown = min(self.config.max_references, len(context.captured) + context.round_number - 1)
         notes = (
             f"shows the {shown} views nearest to where the motion leads, at most {self.config.reference_side_px} px long",
+            *([f"{len(spent)} requests were sent for this scene before"] if spent else []),
         )
         return Forecast(
             prompt=fill_prompt(context.spec),
@@ -131,7 +103,7 @@ class ServiceGenerator:
             context, so_far, limit=config.max_references, long_side_px=config.reference_side_px
         )
         keys = {reference.view_id: reference.pixels_sha256 for reference in references}
-        cache, budget = self._cache(context), _Budget(config)
+        cache, budget = self._cache(context), self._budget(context)
         candidates: list[Candidate] = []
         outcomes: list[Outcome] = []
         errors: list[ServiceError] = []
@@ -170,6 +142,19 @@ class ServiceGenerator:
             )
         return CandidateSet(round=context.round_number, candidates=tuple(candidates), outcomes=tuple(outcomes))
 
+    def _budget(self, context: GenerationContext) -> SceneBudget:
+        config = self.config
+        return SceneBudget(
+            ledger=spent_ledger(context),
+            max_scene_requests=config.max_scene_requests,
+            max_scene_cost_usd=config.max_scene_cost_usd,
+            section="generator",
+            thing="picture",
+            max_requests=config.max_requests,
+            max_cost_usd=config.max_cost_usd,
+            price_usd=config.price_usd,
+        )
+
     def _cache(self, context: GenerationContext) -> AnswerCache:
         config = self.config
         question = {
@@ -182,33 +167,30 @@ class ServiceGenerator:
         }
         return AnswerCache.of(context.cache, question)
 
-    def _answered(self, question: Question, budget: _Budget, *, of: int) -> Answer:
-        """The answer to one question, after as many tries as it takes and the settings allow. Raises `ServiceError`."""
-        for attempt in range(self.config.attempts):
-            budget.spend()
-            started = time.monotonic()
-            try:
-                with _signs_of_life(f"candidate {question.number + 1} of {of}"):
-                    reply = self.service.ask(question)
-                answer = Answer(data=reply.data, provenance=self._provenance(question, reply))
-                logger.info("candidate %d of %d came after %.0f s", question.number + 1, of, time.monotonic() - started)
-                return answer
-            except ServiceError as error:
-                if error.ending == "refused":
-                    return Answer(refused=self._safe(error.reason))
-                if error.ending == "failed_final" or attempt + 1 == self.config.attempts:
-                    raise
-                wait = error.wait_s
-                if wait is not None and wait > _LONGEST_ASKED_WAIT_S:
-                    raise ServiceError(
-                        "failed_final", f"{error.reason} (wants {wait:.0f} s of waiting)", fix="start again later"
-                    ) from None
-                backoff = min(_LONGEST_WAIT_S, _FIRST_WAIT_S * 2**attempt)
-                # Jitter keeps jobs of a sweep apart; it decides nothing about the result.
-                wait = backoff * random.uniform(0.5, 1) if wait is None else wait  # noqa: S311
-                logger.warning("%s; trying again in %.1f s", self._safe(error.reason), wait)
-                self.sleep(wait)
-        raise AssertionError("the last attempt returns or raises")
+    def _answered(self, question: Question, budget: Budget, *, of: int) -> Answer:
+        """The answer to one question, a refusal included. Raises `ServiceError`."""
+        what = f"candidate {question.number + 1} of {of}"
+        started = time.monotonic()
+
+        def ask() -> Answer:
+            reply = self.service.ask(question)
+            return Answer(data=reply.data, provenance=self._provenance(question, reply))
+
+        try:
+            answer = ask_patiently(
+                ask,
+                what=what,
+                attempts=self.config.attempts,
+                budget=budget,
+                secrets=self.service.secrets(),
+                sleep=self.sleep,
+            )
+        except ServiceError as error:
+            if error.ending != "refused":
+                raise
+            return Answer(refused=self._safe(error.reason))
+        logger.info("%s came after %.0f s", what, time.monotonic() - started)
+        return answer
 
     def _provenance(self, question: Question, reply: Reply) -> Provenance:
         """The record of an answer, which is looked at first. Raises `ServiceError` if it is no picture."""
@@ -236,82 +218,7 @@ class ServiceGenerator:
         )
 
     def _safe(self, text: str) -> str:
-        """Without anything that is a secret, or looks like one: services like to repeat the key that they were given."""
-        for secret in self.service.secrets():
-            text = text.replace(secret, "***")
-        return " ".join(_KEY_SHAPED.sub("***", text).split())[:_MAX_REASON]
-
-
-@dataclass(slots=True)
-class _Budget:
-    """Looked at before anything is sent."""
-
-    config: ServiceConfig
-    sent: int = 0
-
-    def spend(self) -> None:
-        """Count one request. Raises `ServiceError` if it is one too many."""
-        config = self.config
-        if self.sent >= config.max_requests:
-            problem = f"{self.sent} requests were sent, as many as generator.max_requests allows"
-            raise ServiceError("failed_final", problem, fix="raise it and start again: what came is kept")
-        if config.max_cost_usd is not None and (self.sent + 1) * (config.price_usd or 0.0) > config.max_cost_usd:
-            problem = f"one more picture would cost more than generator.max_cost_usd ({config.max_cost_usd:g})"
-            raise ServiceError("failed_final", problem, fix="raise it and start again: what came is kept")
-        self.sent += 1
-
-
-@contextmanager
-def _signs_of_life(what: str) -> Iterator[None]:
-    """Say now and then that an answer is still being waited for."""
-    done = Event()
-
-    def speak() -> None:
-        waited = 0.0
-        while not done.wait(_SIGN_OF_LIFE_S):
-            waited += _SIGN_OF_LIFE_S
-            logger.info("%s: waiting for %.0f s", what, waited)
-
-    thread = Thread(target=speak, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-
-
-def http_error(status: int, code: str, message: str, *, key_variable: str | None, wait_s: float | None) -> ServiceError:
-    """What an HTTP status and the provider's own code mean for a request.
-
-    Refusals are what is said to be one by its code, never guessed from words.
-    """
-    reason = f"{message or 'no reason given'} (HTTP {status}{f', {code}' if code else ''})"
-    if code in ("moderation_blocked", "content_policy_violation", "image_generation_user_error"):
-        return ServiceError("refused", reason)
-    if code == "insufficient_quota" or status == 402:
-        return ServiceError("failed_final", reason, fix="the account has no credit left: add some and start again")
-    if status == 401:
-        return ServiceError("failed_final", reason, fix=f"check the key in {key_variable or 'the environment'}")
-    if status == 403:
-        fix = "the account may not use this model: verify the organisation with the provider, or set another generator.model"
-        return ServiceError("failed_final", reason, fix=fix)
-    if status == 404:
-        return ServiceError("failed_final", reason, fix="set generator.model and generator.base_url to what there is")
-    if status in (408, 409, 429) or status >= 500:
-        fix = "start the same command again later: what came is kept"
-        return ServiceError("failed_retryable", reason, fix=fix, wait_s=wait_s)
-    return ServiceError("failed_final", reason, fix="see the settings in conf/generator")
-
-
-def retry_after_s(headers: Mapping[str, str]) -> float | None:
-    """Seconds of a Retry-After header (or Retry-After-Ms); None without one that is a number."""
-    for name, factor in (("retry-after-ms", 0.001), ("retry-after", 1.0)):
-        try:
-            return max(0.0, float(headers[name]) * factor)
-        except (KeyError, ValueError):
-            continue
-    return None
+        return safe_text(text, self.service.secrets())
 
 
 def plain_settings(config: ServiceConfig, *names: str) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from sceneexpander.errors import UserError
+from sceneexpander.exports.formats import check_formats
 from sceneexpander.ranges import Range, Share, check_ranges
 
 _Place = Annotated[float, Range(-1e9, 1e9)]
@@ -53,6 +54,7 @@ class RenderConfig:
         scale: video size relative to the stored images.
         stills: frames that are also kept as pictures, evenly spread.
         background: grey behind the scene, in [0, 1].
+        exports: formats that the scene is also written in, to ``exports/`` (`sceneexpander.exports.FORMATS`).
         spz: write the Gaussians as ``gaussians.spz`` too, a tenth of the PLY, without provenance.
     """
 
@@ -68,8 +70,10 @@ class RenderConfig:
     stills: Annotated[int, Range(1, 1000)] = 6
     background: Share = 0.08
     spz: bool = False
+    exports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        check_formats(self.exports, where="render.exports")
         if self.path == "keyframes" and len(self.keyframes) < 2:
             raise UserError(f"path keyframes needs at least two, has {len(self.keyframes)}", where="render.keyframes")

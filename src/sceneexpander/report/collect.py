@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sceneexpander.artifacts.cameras import CameraReport
 from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.judgement import FILE_NAME as JUDGEMENT
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.page import (
     BaseModel,
@@ -74,7 +75,8 @@ class RoundSource:
 
     ``log`` is the adaptation's, with its looks (``looks.json``, ``looks/``) and the verdict on the inserted view
     (``acceptance.json``) beside it, where there are any; ``statistics`` holds one file per stage run. ``cameras`` is the `CameraReport`
-    of all views, the inserted one included; its folder does not exist where the model needs no cameras.
+    of all views, the inserted one included; its folder does not exist where the model needs no cameras. ``judged`` is the
+    `JudgedRound`.
     """
 
     number: int
@@ -83,6 +85,7 @@ class RoundSource:
     log: Path
     statistics: Path
     cameras: Path | None = None
+    judged: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,12 +180,15 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
     sheet = source.inserted / "sheet.png"
     if sheet.is_file():
         shutil.copyfile(sheet, folder / base / "sheet.png")
+    overlay = source.inserted / "overlay.png"
     spec = scene.round_spec(source.number)
     cameras = gathered_cameras(source.cameras)
     looks = _looks(source.log.parent, folder, base)
     judgement = _read_if_any(Judgement, source.log.parent / "acceptance.json")
     missing = {item.name: lacking for item in source.methods if (lacking := unavailable_in(item.reconstruction))}
     methods = [_method(item, folder, f"{base}/{item.name}") for item in source.methods if item.name not in missing]
+    if source.judged is not None:
+        _copy(source.judged / JUDGEMENT, folder, f"{base}/{JUDGEMENT}")
     return RoundPage(
         number=source.number,
         prompt=spec.prompt,
@@ -199,6 +205,8 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
         inserted_id=inserted.view.view_ids[0],
         viewer=_viewer_place(source.number),
         sheet=f"{base}/sheet.png" if sheet.is_file() else None,
+        overlay=_copy(overlay, folder, f"{base}/overlay.png") if overlay.is_file() else None,
+        misalignment=None if inserted.misalignment is None else inserted.misalignment.words,
         methods=tuple(methods),
         unavailable=tuple(
             MissingMethod(

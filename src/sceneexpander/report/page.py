@@ -16,6 +16,7 @@ from sceneexpander.catalogue.methods import CAPTURED, known_method
 from sceneexpander.report.cameras import cameras_shown
 from sceneexpander.report.course import FITTED, fits, looks_shown, verdict
 from sceneexpander.report.curve import curve_chart, objective_curves, smoothing_window
+from sceneexpander.report.judged import load_judged, page_table
 from sceneexpander.report.words import LAYERS, PICTURE_KINDS, method_label, number_tables
 
 _Filled = dict[str, Any]  # what a part of the template is filled with
@@ -64,18 +65,22 @@ def _scene(page: ScenePage, folder: Path) -> _Filled:
 def _round(page: RoundPage, scene: ScenePage, folder: Path) -> _Filled:
     rows = {method.name: MetricsRow.load(folder / method.metrics) for method in page.methods}
     labels = {method.name: method_label(method.name, method.model, rows[method.name].fit) for method in page.methods}
+    judged = load_judged(folder / f"round_{page.number}")
     loss = page.steps.values.get("loss", ())
     curves = objective_curves(page.steps.inserted if loss else (), loss)
     return {
         "page": page,
         "made": PICTURE_KINDS.get(page.source_type or "", "Picture"),
         "reasons": [f"candidate {score.candidate}: {score.reason}" for score in page.ranking],
+        "overlay": page.overlay,
+        "misalignment": page.misalignment,
         "sheet": page.sheet if page.candidates > 1 else None,
         "methods": [_shown_method(method, labels[method.name]) for method in page.methods],
         "main": MAIN,
         "cameras": cameras_shown(page.cameras, _pictures(scene)),
         "tables": [
-            found for title, shown in number_tables() if (found := _table(title, shown, labels, rows)) is not None
+            *(found for title, shown in number_tables() if (found := _table(title, shown, labels, rows)) is not None),
+            *([] if judged is None else [page_table(judged, labels)]),
         ],
         "left_out": _left_out(rows, _names(scene)),
         "meanings": [(labels[method.name], _method_meaning(method)) for method in page.methods],

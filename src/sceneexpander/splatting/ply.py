@@ -5,6 +5,9 @@ The layout is the usual one of 3D Gaussian splatting: position ``x y z``, unused
 scalar-first quaternion; float32, binary little-endian. Provenance follows in two properties that other programs skip:
 ``source_view`` (-1 unknown) and ``generated`` (0 or 1). They are float32 too: some readers take rows for arrays of floats.
 
+`write_ply` can leave them out, for readers that know one row length only, and can add ``red green blue`` (bytes, colour of degree 0), which
+MeshLab and CloudCompare show.
+
 A comment says how opacities are meant (`Gaussians.antialiased`), as gsplat, nerfstudio, Brush and splat-transform write and read it:
 ``SplatRenderMode: mip`` for rasterisers that compensate them for the screen blur, ``default`` for others.
 """
@@ -12,7 +15,7 @@ A comment says how opacities are meant (`Gaussians.antialiased`), as gsplat, ner
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -23,7 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sceneexpander.errors import UserError
-from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
 from sceneexpander.splatting.files import complete_file
 from sceneexpander.splatting.scene import check_finite
 
@@ -41,16 +44,33 @@ SCALAR_TYPES = {
 FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 PROVENANCE = ("source_view", "generated")
+COLOURS = ("red", "green", "blue")
 COMPRESSED = {"packed_position", "packed_rotation", "packed_scale", "packed_color"}
 RENDER_MODES = {True: "mip", False: "default"}
 MAX_COUNT_DIGITS = 15
+MOST_VIEWS = 1 << 31
+MAX_COMMENT = 1000  # letters of one line; the header as a whole is bounded by `MAX_HEADER_BYTES`
 FEWEST_TO_JUDGE = 10  # of fewer Gaussians nobody can say what their numbers mean
 WIDE_OVERLAP = 3.0  # size of the usual Gaussian in distances between neighbours, beyond which a scene would be fog
 _log = logging.getLogger(__name__)
 
 
-def write_ply(gaussians: Gaussians, path: Path) -> None:
+def write_ply(
+    gaussians: Gaussians,
+    path: Path,
+    *,
+    provenance: bool = True,
+    rgb: bool = False,
+    comments: Sequence[str] = (),
+) -> None:
     """Write a scene, atomically. Opacities are kept within 1e-6 of 0 and 1 (their logits must be finite).
+
+    Args:
+        gaussians: the scene.
+        path: of the file.
+        provenance: with ``source_view`` and ``generated``.
+        rgb: with ``red green blue``; then a row is no longer an array of floats.
+        comments: lines for people, put into the header.
 
     Raises:
         ValueError: values that no PLY can carry (not finite, SH degree above 3), naming the tensor.
@@ -62,32 +82,45 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
         check_finite(name, getattr(gaussians, name))
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(rest)]
-    names += ["opacity", "scale_0", "scale_1", "scale_2", *ROTATION]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", *ROTATION, *(PROVENANCE if provenance else ())]
     mode = f"comment SplatRenderMode: {RENDER_MODES[gaussians.antialiased]}"
-    header = ["ply", "format binary_little_endian 1.0", mode, f"element vertex {len(gaussians)}"]
-    header += [*(f"property float {name}" for name in (*names, *PROVENANCE)), "end_header"]
+    header = ["ply", "format binary_little_endian 1.0", mode, *map(ply_comment, comments)]
+    header += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in names)]
+    header += [*(f"property uchar {name}" for name in COLOURS if rgb), "end_header"]
     with complete_file(path) as scratch, scratch.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         scene = gaussians.detach()
         for start in range(0, len(scene), ROWS_PER_CHUNK):
-            _write_rows(file, scene, slice(start, start + ROWS_PER_CHUNK))
+            rows = scene.select(torch.arange(start, min(start + ROWS_PER_CHUNK, len(scene))))
+            floats = _float_columns(rows, provenance=provenance)
+            file.write(_with_colours(floats, rows) if rgb else floats.data)
         file.flush()
 
 
-def _write_rows(file: BinaryIO, scene: Gaussians, rows: slice) -> None:
+def ply_comment(text: str) -> str:
+    """A header's line that says ``text`` to people: one line of ASCII, at most 1000 letters of it."""
+    plain = " ".join(text.split()).encode("ascii", "backslashreplace").decode("ascii")
+    return f"comment {plain[:MAX_COMMENT]}"
+
+
+def _float_columns(scene: Gaussians, *, provenance: bool) -> NDArray[np.float32]:
     columns = [
-        scene.means[rows],
-        torch.zeros_like(scene.means[rows]),
-        scene.sh[rows, 0],
-        scene.sh[rows, 1:].transpose(1, 2).flatten(1),
-        torch.logit(scene.opacities[rows].double(), eps=OPACITY_MARGIN)[:, None],
-        scene.scales[rows].clamp(min=SMALLEST_SCALE).log(),
-        torch.nn.functional.normalize(scene.quat_wxyz[rows], dim=-1),
-        scene.source_view[rows, None],
-        scene.generated[rows, None],
+        scene.means,
+        torch.zeros_like(scene.means),
+        scene.sh[:, 0],
+        scene.sh[:, 1:].transpose(1, 2).flatten(1),
+        torch.logit(scene.opacities.double(), eps=OPACITY_MARGIN)[:, None],
+        scene.scales.clamp(min=SMALLEST_SCALE).log(),
+        torch.nn.functional.normalize(scene.quat_wxyz, dim=-1),
     ]
-    floats = torch.cat([c.float().cpu() for c in columns], 1).numpy().astype("<f4", copy=False)
-    file.write(floats.data)
+    if provenance:
+        columns += [scene.source_view[:, None], scene.generated[:, None]]
+    return torch.cat([c.float().cpu() for c in columns], 1).numpy().astype("<f4", copy=False)
+
+
+def _with_colours(floats: NDArray[np.float32], scene: Gaussians) -> bytes:
+    colours = (rgb_from_sh(scene.sh[:, 0]).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    return np.concatenate([floats.view(np.uint8), colours], 1).tobytes()
 
 
 def read_ply(path: Path, *, linear: Collection[Linear] = ()) -> Gaussians:
@@ -275,8 +308,10 @@ def _gaussians(table: NDArray[np.void], header: _Header, path: Path, linear: fro
 
     higher = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(len(table), 3, rest // 3).transpose(1, 2)
     unknown = np.full(len(table), -1, np.int64)
-    if "source_view" in names and not np.isfinite(table["source_view"]).all():
-        raise UserError("has a source_view that is no number", where=path)
+    if (
+        "source_view" in names and not (np.abs(table["source_view"].astype(np.float64)) < MOST_VIEWS).all()
+    ):  # NaN neither
+        raise UserError("has a source_view that is no number of a view", where=path)
     source_view = table["source_view"].astype(np.int64) if "source_view" in names else unknown
     means, opacities, scales = (
         columns("x", "y", "z"),

@@ -7,17 +7,22 @@ rotation 0.2 degrees; higher harmonics 1/16 (degree 1) and 1/8 (degrees 2, 3) as
 **Provenance is lost**: SPZ has no place for it. Write a PLY to keep it. How opacities are meant (`Gaussians.antialiased`) is kept.
 
 Layout: a header of 16 bytes, then positions (24-bit fixed point), opacities, colours, logarithms of the scales, rotations (the
-smallest three components of the quaternion in 10 bits each), higher harmonics; everything through gzip. Axes are x right, y up,
-z backwards, where scenes here (like PLY files) have y down and z forward. Version 3 is written, versions 2 and 3 are read.
+smallest three components of the quaternion in 10 bits each), higher harmonics; everything through gzip. Version 4 holds the
+same bytes, but its header (32 bytes) is followed by a table of lengths (compressed, whole; 64 bits each) and one Zstandard stream
+per kind of value. Axes are x right, y up, z backwards, where scenes here (like PLY files) have y down and z forward. Versions 3
+and 4 are written, 2 to 4 are read.
 """
 
 from __future__ import annotations
 
 import gzip
+import logging
 import math
 import struct
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,9 +37,11 @@ from sceneexpander.splatting.scene import check_finite
 from sceneexpander.splatting.torch_backend import sh_basis
 
 MAGIC = 0x5053474E  # "NGSP"
-VERSION = 3
+Version = Literal[3, 4]
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
-ANTIALIASED = 1  # the bit of the flags
+HEADER_4 = struct.Struct("<IIIBBBBI12x")  # the same with the number of streams, then where their table starts
+STREAM = struct.Struct("<QQ")  # of that table: bytes in the file, bytes inflated
+ANTIALIASED, EXTENDED = 1, 2  # bits of the flags
 COORDINATE_LIMIT = (1 << 23) - 1
 MOST_FRACTIONAL_BITS = 23
 COLOUR_GAIN = 0.15  # a byte of colour is 255 * (0.5 + gain * coefficient)
@@ -45,13 +52,20 @@ ROTATION_BITS = 9  # of a component's size, beside its sign
 # Real scenes come to a third or half of their size, equal Gaussians to a hundredth; gzip itself reaches a thousandth, and a file of a
 # megabyte would become gigabytes in memory.
 WORST_RATIO, SMALL_BYTES = 50, 64 << 20
-_ROTATION_BYTES = {2: 3, 3: 4}
+_ROTATION_BYTES = {2: 3, 3: 4, 4: 4}
+_MOST_DEGREE = {2: 3, 3: 3, 4: 4}
+_LARGEST_WINDOW = 1 << 27  # bytes of memory that a Zstandard stream may ask for
+_ZSTD_LEVEL = 9
+_log = logging.getLogger(__name__)
 
 
-def write_spz(gaussians: Gaussians, path: Path) -> int:
+def write_spz(gaussians: Gaussians, path: Path, *, version: Version = 3) -> int:
     """Write a scene, atomically; returns the number of Gaussians of which some value was cut to the format's range.
 
+    Version 3 opens in most programs, version 4 in the newest.
+
     Raises:
+        UserError: version 4 needs the package zstandard, which is not installed.
         ValueError: values that are not finite or positions beyond 8.3 million scene units, naming the tensor and row.
     """
     scene = gaussians.detach().to("cpu")
@@ -75,13 +89,15 @@ def write_spz(gaussians: Gaussians, path: Path) -> int:
     scales, cut_scales = _bytes(SCALE_STEPS * (scene.scales.clamp(min=1e-30).log() + SCALE_OFFSET))
     harmonics, cut_harmonics = _bytes(_rounded(SH_GAIN * (1 + scene.sh[:, 1:] * _signs(degree))))
     columns = [positions, opacities, colours, scales, _pack_rotations(scene.quat_wxyz), harmonics]
-    body = HEADER.pack(MAGIC, VERSION, len(scene), degree, bits, ANTIALIASED * scene.antialiased, 0) + b"".join(
-        c.tobytes() for c in columns
-    )
+    streams = [column.tobytes() for column in columns]
+    facts = (MAGIC, version, len(scene), degree, bits, ANTIALIASED * scene.antialiased)
     with complete_file(path) as scratch, scratch.open("wb") as file:
-        # No time and no name inside: the same scene gives the same bytes.
-        with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0, compresslevel=6) as packed:
-            packed.write(body)
+        if version == 4:
+            file.write(_zstd_file(facts, streams))
+        else:
+            # No time and no name inside: the same scene gives the same bytes.
+            with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0, compresslevel=6) as packed:
+                packed.write(HEADER.pack(*facts, 0) + b"".join(streams))
         file.flush()
     return int((cut_colours | cut_scales | cut_harmonics).sum())
 
@@ -99,7 +115,8 @@ def read_spz(path: Path) -> Gaussians:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise UserError(f"cannot be read ({reason})", where=str(path)[:300]) from None
-    version, count, degree, bits, flags, body = _unpack(raw, path)
+    header, body = _unpack(raw, path)
+    count, degree = header.count, header.degree
     at = 0
 
     def take(*shape: int) -> NDArray[np.uint8]:
@@ -110,12 +127,16 @@ def read_spz(path: Path) -> Gaussians:
 
     fixed = np.zeros((count, 3, 4), np.uint8)
     fixed[:, :, 1:] = take(3, 3)  # in the upper bytes, so that the shift below brings the sign along
-    means = torch.from_numpy((fixed.view("<i4")[..., 0] >> 8).astype(np.float64) / (1 << bits)).float()
+    means = torch.from_numpy((fixed.view("<i4")[..., 0] >> 8).astype(np.float64) / (1 << header.bits)).float()
     opacities = _floats(take(1))[:, 0] / 255
     colours = (_floats(take(3)) / 255 - 0.5) / COLOUR_GAIN
     scales = (_floats(take(3)) / SCALE_STEPS - SCALE_OFFSET).exp()
-    quats = _unpack_rotations(take(_ROTATION_BYTES[version]))
-    higher = (_floats(take((degree + 1) ** 2 - 1, 3)) / SH_GAIN - 1) * _signs(degree)
+    quats = _unpack_rotations(take(_ROTATION_BYTES[header.version]))
+    stored = _floats(take((degree + 1) ** 2 - 1, 3)) / SH_GAIN - 1
+    if degree > 3:
+        _log.warning("%s: harmonics of degree 4 are left out, scenes here hold degrees 0 to 3", path)
+    kept = min(degree, 3)
+    higher = stored[:, : (kept + 1) ** 2 - 1] * _signs(kept)
     return Gaussians(
         means=means * torch.tensor([1.0, -1.0, -1.0]),
         quat_wxyz=quats,
@@ -124,16 +145,61 @@ def read_spz(path: Path) -> Gaussians:
         sh=torch.cat([colours[:, None], higher], 1),
         source_view=torch.full((count,), -1),
         generated=torch.zeros(count, dtype=torch.bool),
-        antialiased=bool(flags & ANTIALIASED),
+        antialiased=header.antialiased,
     )
 
 
-def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, int, NDArray[np.uint8]]:
-    """(version, count, degree, fractional bits, flags, everything after the header); never inflates more than the header announces."""
-    if raw[:4] == MAGIC.to_bytes(4, "little"):  # the header of versions before is compressed like the rest
-        version = int.from_bytes(raw[4:8], "little")
-        fix = "write it as version 3 or as PLY, e.g. with splat-transform"
-        raise UserError(f"is SPZ {version}, which is not read here: versions 2 and 3 are", where=path, fix=fix)
+def _zstd_file(facts: tuple[int, ...], streams: list[bytes]) -> bytes:
+    present = [
+        stream for stream in streams if stream
+    ]  # without higher harmonics, or without Gaussians, there are fewer
+    packed = [_zstd().ZstdCompressor(level=_ZSTD_LEVEL).compress(stream) for stream in present]
+    table = [STREAM.pack(len(small), len(whole)) for small, whole in zip(packed, present, strict=True)]
+    return b"".join([HEADER_4.pack(*facts, len(present), HEADER_4.size), *table, *packed])
+
+
+def _zstd() -> Any:
+    try:
+        import zstandard
+    except ImportError:
+        fix = "pip install zstandard, or use SPZ 3"
+        raise UserError("needs the package zstandard", where="SPZ 4", fix=fix) from None
+    return zstandard
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    version: int
+    count: int
+    degree: int
+    bits: int  # of coordinates behind the binary point
+    antialiased: bool
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Bytes of positions, opacities, colours, scales, rotations, higher harmonics."""
+        harmonics = 3 * ((self.degree + 1) ** 2 - 1)
+        return tuple(self.count * width for width in (9, 1, 3, 3, _ROTATION_BYTES[self.version], harmonics))
+
+
+def _unpack(raw: bytes, path: Path) -> tuple[_Header, NDArray[np.uint8]]:
+    """(header, all values); never inflates more than the header announces."""
+    # The header of versions before 4 is compressed like the rest.
+    header, body = _unpack_4(raw, path) if raw[:4] == MAGIC.to_bytes(4, "little") else _unpack_gzip(raw, path)
+    return header, np.frombuffer(body, np.uint8)
+
+
+def _check_header(version: int, count: int, degree: int, bits: int, flags: int, size: int, path: Path) -> _Header:
+    if degree > _MOST_DEGREE[version] or bits > MOST_FRACTIONAL_BITS:
+        most = _MOST_DEGREE[version]
+        raise UserError(f"has SH degree {degree} and {bits} fractional bits, at most {most} and 23 exist", where=path)
+    header = _Header(version, count, degree, bits, bool(flags & ANTIALIASED))
+    if sum(header.lengths) > max(SMALL_BYTES, WORST_RATIO * size):
+        raise UserError(f"announces {count} Gaussians, too many for a file of {size} bytes", where=path)
+    return header
+
+
+def _unpack_gzip(raw: bytes, path: Path) -> tuple[_Header, bytes]:
     inflate = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         head = inflate.decompress(raw, HEADER.size)
@@ -142,13 +208,10 @@ def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, int, NDArray[np
         magic, version, count, degree, bits, flags, _ = HEADER.unpack(head)
         if magic != MAGIC:
             raise UserError("is not an SPZ file (its mark is missing)", where=path)
-        if version not in _ROTATION_BYTES:
-            raise UserError(f"has SPZ version {version}", where=path, fix="versions 2 and 3 can be read")
-        if degree > 3 or bits > MOST_FRACTIONAL_BITS:
-            raise UserError(f"has SH degree {degree} and {bits} fractional bits, at most 3 and 23 exist", where=path)
-        expected = count * (9 + 1 + 3 + 3 + _ROTATION_BYTES[version] + 3 * ((degree + 1) ** 2 - 1))
-        if expected > max(SMALL_BYTES, WORST_RATIO * len(raw)):
-            raise UserError(f"announces {count} Gaussians, too many for a file of {len(raw)} bytes", where=path)
+        if version not in (2, 3):
+            raise UserError(f"has SPZ version {version}", where=path, fix="versions 2 to 4 can be read")
+        header = _check_header(version, count, degree, bits, flags, len(raw), path)
+        expected = sum(header.lengths)
         body = inflate.decompress(inflate.unconsumed_tail, expected + 1)
         if not inflate.eof:
             inflate.decompress(inflate.unconsumed_tail, 1)  # to the end of the stream, where its check sum is
@@ -161,7 +224,54 @@ def _unpack(raw: bytes, path: Path) -> tuple[int, int, int, int, int, NDArray[np
         raise UserError("is truncated: its check sum is missing", where=path)
     if inflate.unused_data:
         raise UserError(f"holds {len(inflate.unused_data)} bytes behind its end", where=path)
-    return version, count, degree, bits, flags, np.frombuffer(body, np.uint8)
+    return header, body
+
+
+def _unpack_4(raw: bytes, path: Path) -> tuple[_Header, bytes]:
+    if len(raw) < HEADER_4.size:
+        raise UserError("is not an SPZ file (too short)", where=path)
+    _, version, count, degree, bits, flags, streams, at = HEADER_4.unpack_from(raw)
+    if version != 4:
+        raise UserError(f"has SPZ version {version}", where=path, fix="versions 2 to 4 can be read")
+    header = _check_header(version, count, degree, bits, flags, len(raw), path)
+    if flags & EXTENDED:
+        _log.warning("%s: holds extensions, which are not read", path)
+    lengths = [length for length in header.lengths if length]
+    # Some writers list a stream without bytes too.
+    if streams not in (len(lengths), len(header.lengths)):
+        raise UserError(f"holds {streams} streams, expected {len(lengths)}", where=path)
+    if streams == len(header.lengths):
+        lengths = list(header.lengths)
+    start = at + streams * STREAM.size
+    if at < HEADER_4.size or start > len(raw):
+        raise UserError("is truncated: its table of streams is missing", where=path)
+    parts = []
+    for number, expected in enumerate(lengths):
+        packed, whole = STREAM.unpack_from(raw, at + number * STREAM.size)
+        if whole != expected:
+            raise UserError(f"stream {number} announces {whole} bytes, expected {expected}", where=path)
+        if start + packed > len(raw):
+            raise UserError(f"is truncated: stream {number} ends behind its end", where=path)
+        parts.append(_inflate_zstd(raw[start : start + packed], expected, number, path))
+        start += packed
+    if start != len(raw):
+        raise UserError(f"holds {len(raw) - start} bytes behind its end", where=path)
+    return header, b"".join(parts)
+
+
+def _inflate_zstd(packed: bytes, expected: int, number: int, path: Path) -> bytes:
+    if not packed and not expected:
+        return b""
+    library = _zstd()
+    try:
+        reader = library.ZstdDecompressor(max_window_size=_LARGEST_WINDOW).stream_reader(packed)
+        body = reader.read(expected + 1)
+    except (library.ZstdError, MemoryError):
+        raise UserError(f"stream {number} is damaged", where=path) from None
+    if len(body) != expected:
+        found = "more" if len(body) > expected else str(len(body))
+        raise UserError(f"stream {number} holds {found} bytes, expected {expected}", where=path)
+    return body
 
 
 def _bytes(values: Float[Tensor, "gaussian *rest"]) -> tuple[NDArray[np.uint8], Tensor]:

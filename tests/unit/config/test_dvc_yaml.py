@@ -68,11 +68,14 @@ def filled(path: str) -> str:
             [
                 layout.config("S"),
                 layout.selection("S"),
-                *(layout.given("S", kind) for kind in ("generator", "choice", "model", *methods_of(Kind.RIVAL))),
+                *(
+                    layout.given("S", kind)
+                    for kind in ("generator", "choice", "judge", "model", *methods_of(Kind.RIVAL))
+                ),
             ],
         ),
         ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
-        ("reconstruct", [layout.state("S", 0), layout.statistics("reconstruct", "S")]),
+        ("reconstruct", [layout.state("S", 0), layout.match_memory("S"), layout.statistics("reconstruct", "S")]),
         ("generate_view", [layout.candidates("S", 2), layout.statistics("generate_view", "S", 2)]),
         ("choose_view", [layout.inserted("S", 2), layout.statistics("choose_view", "S", 2)]),
         (
@@ -120,6 +123,7 @@ def filled(path: str) -> str:
         ("render", [layout.renders("S", 2, "backbone"), layout.statistics("render", "S", 2, "backbone")]),
         ("pack", [layout.packed("S", 2, "backbone"), layout.statistics("pack", "S", 2, "backbone")]),
         ("evaluate", [layout.metrics("S", 2, "backbone"), layout.statistics("evaluate", "S", 2, "backbone")]),
+        ("judge", [layout.judged("S", 2), layout.statistics("judge", "S", 2)]),
         ("collect", [layout.PAGES / "S"]),
         ("report", [layout.REPORT, Path("results/metrics.json")]),
     ],
@@ -138,7 +142,10 @@ def test_nothing_persists_but_what_belongs_to_this_machine() -> None:
         for path, options in item.items()
         if options.get("persist")
     }
-    given = {layout.given("S", kind).as_posix() for kind in ("generator", "choice", "model", *methods_of(Kind.RIVAL))}
+    given = {
+        layout.given("S", kind).as_posix()
+        for kind in ("generator", "choice", "judge", "model", *methods_of(Kind.RIVAL))
+    }
     # Never restored from the cache of runs (another machine's environment), never copied into it (links to the user's files).
     assert persistent == {"mlflow/tracked.json", layout.CODE.as_posix(), layout.ENVIRONMENT.as_posix()} | given
 

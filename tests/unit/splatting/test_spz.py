@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import zstandard
 
 from sceneexpander.errors import UserError
-from sceneexpander.geometry.gaussians import Gaussians
+from sceneexpander.geometry.gaussians import ROWS, Gaussians
 from sceneexpander.geometry.rigid import rotation_angle_deg, rotation_from_quat_wxyz
 from sceneexpander.splatting import render
 from sceneexpander.splatting.spz import HEADER, MAGIC, read_spz, write_spz
@@ -157,7 +158,7 @@ def test_an_empty_scene_and_bad_values(tmp_path: Path) -> None:
         (lambda raw: raw + b"x", "announces 5 Gaussians in 145 bytes and holds more"),
         (lambda raw: raw[:7], "too short"),
         (lambda raw: b"ply\n" + raw[4:], "its mark is missing"),
-        (lambda raw: raw[:4] + b"\x04" + raw[5:], "has SPZ version 4; versions 2 and 3 can be read"),
+        (lambda raw: raw[:4] + b"\x04" + raw[5:], "has SPZ version 4; versions 2 to 4 can be read"),
         (lambda raw: raw[:12] + b"\x09" + raw[13:], "has SH degree 9"),
         (lambda raw: raw[:8] + b"\xff\xff\xff\xff" + raw[12:], "announces 4294967295 Gaussians, too many"),
     ],
@@ -180,11 +181,74 @@ def test_what_is_no_gzip_is_refused(tmp_path: Path) -> None:
         read_spz(tmp_path / "b.spz")
 
 
-@pytest.mark.parametrize("version", [4, 5, 99])
-def test_a_version_with_a_plain_header_is_named(tmp_path: Path, version: int) -> None:
+@pytest.mark.parametrize("version", [3, 5, 99])
+def test_a_version_with_a_plain_header_that_is_not_4_is_named(tmp_path: Path, version: int) -> None:
     (tmp_path / "a.spz").write_bytes(b"NGSP" + version.to_bytes(4, "little") + bytes(40))
-    with pytest.raises(UserError, match=f"is SPZ {version}, which is not read here"):
+    with pytest.raises(UserError, match=f"has SPZ version {version}; versions 2 to 4"):
         read_spz(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("sh_coefficients", [1, 4, 9, 16])
+@pytest.mark.parametrize("count", [0, 1, 200])
+def test_version_4_holds_what_version_3_holds(tmp_path: Path, sh_coefficients: int, count: int) -> None:
+    scene = replace(bounded(max(count, 1), sh_coefficients).select(torch.arange(count)), antialiased=True)
+    write_spz(scene, tmp_path / "3.spz")
+    write_spz(scene, tmp_path / "4.spz", version=4)
+    three, four = read_spz(tmp_path / "3.spz"), read_spz(tmp_path / "4.spz")
+    for name in ROWS:
+        assert torch.equal(getattr(three, name), getattr(four, name)), name
+    assert four.antialiased
+
+
+def version_4(folder: Path, count: int = 5) -> bytes:
+    write_spz(bounded(count), folder / "a.spz", version=4)
+    return (folder / "a.spz").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda raw: raw[:20], "too short"),
+        (lambda raw: raw[:40], "its table of streams is missing"),
+        (lambda raw: raw[:-1], "is truncated: stream 5 ends behind its end"),
+        (lambda raw: raw + b"xy", "holds 2 bytes behind its end"),
+        (lambda raw: raw[:12] + b"\x05" + raw[13:], "has SH degree 5"),
+        (lambda raw: raw[:8] + b"\xff\xff\xff\xff" + raw[12:], "announces 4294967295 Gaussians, too many"),
+        (lambda raw: raw[:8] + b"\x06" + raw[9:], "stream 0 announces 45 bytes, expected 54"),
+        (lambda raw: raw[:15] + b"\x02" + raw[16:], "holds 2 streams, expected 6"),
+        (lambda raw: raw[:128] + b"\0\0\0\0" + raw[132:], "stream 0 is damaged"),
+    ],
+)
+def test_a_damaged_version_4_is_one_line(tmp_path: Path, damage: Callable[[bytes], bytes], message: str) -> None:
+    (tmp_path / "a.spz").write_bytes(damage(version_4(tmp_path)))
+    with pytest.raises(UserError, match=message) as caught:
+        read_spz(tmp_path / "a.spz")
+    assert "\n" not in caught.value.line()
+
+
+def test_a_stream_that_inflates_to_more_than_it_announces_is_refused(tmp_path: Path) -> None:
+    raw = version_4(tmp_path)
+    packed = zstandard.ZstdCompressor().compress(bytes(1 << 24))
+    first = int.from_bytes(raw[32:40], "little")
+    table = len(packed).to_bytes(8, "little") + raw[40:128]
+    (tmp_path / "a.spz").write_bytes(raw[:32] + table + packed + raw[128 + first :])
+    with pytest.raises(UserError, match="stream 0 holds more bytes, expected 45"):
+        read_spz(tmp_path / "a.spz")
+
+
+def test_degree_4_is_read_without_its_last_band(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_spz(bounded(3, 16), tmp_path / "a.spz", version=4)
+    three = read_spz(tmp_path / "a.spz")
+    raw = (tmp_path / "a.spz").read_bytes()
+    lengths = [int.from_bytes(raw[32 + 16 * i : 40 + 16 * i], "little") for i in range(6)]
+    at = 128 + sum(lengths[:5])
+    low = np.frombuffer(zstandard.ZstdDecompressor().decompress(raw[at:]), np.uint8).reshape(3, 15, 3)
+    high = np.concatenate([low, np.full((3, 9, 3), 77, np.uint8)], 1).tobytes()
+    packed = zstandard.ZstdCompressor().compress(high)
+    table = raw[32:112] + len(packed).to_bytes(8, "little") + len(high).to_bytes(8, "little")
+    (tmp_path / "a.spz").write_bytes(raw[:12] + b"\x04" + raw[13:32] + table + raw[128:at] + packed)
+    assert torch.equal(read_spz(tmp_path / "a.spz").sh, three.sh)
+    assert "degree 4 are left out" in caplog.text
 
 
 @pytest.mark.parametrize("tail", [b"x", b"\0" * 512, b"PK\3\4more", gzip.compress(b"more", mtime=0)])

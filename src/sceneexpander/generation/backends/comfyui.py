@@ -18,17 +18,10 @@ from typing import Annotated, Any
 
 from sceneexpander.errors import UserError
 from sceneexpander.generation.config import ServiceConfig, picture_path
-from sceneexpander.generation.service import (
-    Question,
-    Reply,
-    ServiceError,
-    ServiceGenerator,
-    http_error,
-    plain_settings,
-    retry_after_s,
-)
+from sceneexpander.generation.service import Question, Reply, ServiceGenerator, plain_settings
 from sceneexpander.plainfiles import read_plain_file
 from sceneexpander.ranges import Range
+from sceneexpander.services.transport import ServiceError, http_error, retry_after_s
 
 _LARGEST_WORKFLOW = 16 * 2**20
 _TEXTS, _SEEDS = ("text", "prompt", "value", "string"), ("seed", "noise_seed", "value")

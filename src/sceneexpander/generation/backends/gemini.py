@@ -12,15 +12,8 @@ from typing import Any
 
 from sceneexpander.errors import UserError
 from sceneexpander.generation.config import ServiceConfig
-from sceneexpander.generation.service import (
-    Question,
-    Reply,
-    ServiceError,
-    ServiceGenerator,
-    http_error,
-    plain_settings,
-    retry_after_s,
-)
+from sceneexpander.generation.service import Question, Reply, ServiceGenerator, plain_settings
+from sceneexpander.services.transport import ServiceError, http_error, retry_after_s
 
 _REFUSED = ("SAFETY", "PROHIBITED", "RECITATION", "BLOCKLIST", "SPII", "MODEL_ARMOR")  # in the reasons for ending
 

@@ -4,28 +4,18 @@ from __future__ import annotations
 
 import base64
 import binascii
-import importlib.util
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
-from sceneexpander.errors import UserError
 from sceneexpander.generation.config import ServiceConfig
-from sceneexpander.generation.service import (
-    Question,
-    Reply,
-    ServiceError,
-    ServiceGenerator,
-    http_error,
-    plain_settings,
-    retry_after_s,
-)
+from sceneexpander.generation.service import Question, Reply, ServiceGenerator, plain_settings
 from sceneexpander.ranges import Range
+from sceneexpander.services.openai_client import OpenAIAccess
+from sceneexpander.services.transport import ServiceError
 
-_NO_KEY = "none"  # what a server without keys is sent: the client insists on one
 _LARGEST_DOWNLOAD = 64 * 2**20
 
 
@@ -62,18 +52,13 @@ def make_openai(config: OpenAIConfig) -> ServiceGenerator:
 
 @dataclass(frozen=True, slots=True)
 class OpenAIService:
-    """See `Service`. The client's own retries are off: ours know the budget."""
+    """See `Service`."""
 
     config: OpenAIConfig
 
     def require(self) -> None:
         """The package and the key."""
-        if importlib.util.find_spec("openai") is None:
-            fix = "pip install 'sceneexpander[openai]'"
-            raise UserError("needs the package openai, which is not installed", where="generator openai", fix=fix)
-        if self.config.key_variable is not None and not os.environ.get(self.config.key_variable):
-            fix = "export it, or set generator.key_variable=null for a server without keys"
-            raise UserError("is not set, and holds the service's key", where=self.config.key_variable, fix=fix)
+        self._access().require("generator openai")
 
     def identity(self) -> Mapping[str, object]:
         """Address, model, and what is asked for."""
@@ -82,47 +67,28 @@ class OpenAIService:
 
     def secrets(self) -> tuple[str, ...]:
         """The key."""
-        key = os.environ.get(self.config.key_variable or "", "")
-        return (key,) if key else ()
+        return self._access().secrets()
 
     def ask(self, question: Question) -> Reply:
         """One request for one picture."""
-        import openai
-
         config = self.config
-        key = os.environ.get(config.key_variable, "") if config.key_variable else _NO_KEY
-        client = openai.OpenAI(
-            api_key=key or _NO_KEY, base_url=config.base_url, max_retries=0, timeout=config.timeout_s
-        )
         size = asked_size(question.height, question.width, config)
         arguments: dict[str, Any] = {"model": config.model, "prompt": question.prompt, "n": 1, "size": size}
         if config.quality is not None:
             arguments["quality"] = config.quality
         files = [(f"{item.view_id}.png", item.png, "image/png") for item in question.references]
-        try:
-            raw = client.images.with_raw_response.edit(image=files, extra_body=config.extra_body or None, **arguments)
-            content = json.loads(raw.text)
-        except openai.APITimeoutError:
-            fix = "raise generator.timeout_s, or start again later"
-            raise ServiceError("failed_retryable", f"no answer within {config.timeout_s:g} s", fix=fix) from None
-        except openai.APIConnectionError as error:
-            cause = error.__cause__ or error
-            fix = f"check the network{f' and {config.base_url}' if config.base_url else ''}, then start again"
-            raise ServiceError("failed_retryable", f"no connection: {cause}", fix=fix) from None
-        except openai.APIStatusError as error:
-            raise _refused_or_failed(error, config) from None
-        except ValueError:
-            fix = "start again later, or look at the server's own log"
-            raise ServiceError("failed_retryable", "the answer is not valid JSON", fix=fix) from None
-        finally:
-            client.close()
+        content, request_id = self._access().send(
+            lambda client: client.images.with_raw_response.edit(
+                image=files, extra_body=config.extra_body or None, **arguments
+            )
+        )
         if not isinstance(content, dict):
             raise ServiceError("failed_final", "the answer is JSON, but no answer of an images endpoint")
         usage = content.get("usage")
         return Reply(
             data=_picture_of(content, config),
             model=config.model,
-            request_id=raw.headers.get("x-request-id"),
+            request_id=request_id,
             usage={name: count for name, count in usage.items() if isinstance(count, int)}
             if isinstance(usage, dict)
             else {},
@@ -136,6 +102,15 @@ class OpenAIService:
                 },
                 **({"extra_body": json.dumps(config.extra_body, sort_keys=True)} if config.extra_body else {}),
             },
+        )
+
+    def _access(self) -> OpenAIAccess:
+        config = self.config
+        return OpenAIAccess(
+            base_url=config.base_url,
+            key_variable=config.key_variable,
+            timeout_s=config.timeout_s,
+            section="generator",
         )
 
 
@@ -156,23 +131,6 @@ def _ratio(text: str) -> float:
         return int(width) / int(height)
     except (ValueError, ZeroDivisionError):
         raise ServiceError("failed_final", f"generator.sizes holds {text!r}", fix="write WIDTHxHEIGHT") from None
-
-
-def _refused_or_failed(error: Any, config: OpenAIConfig) -> ServiceError:
-    body = error.body if isinstance(error.body, dict) else {}
-    kinds = [body.get(name) for name in ("code", "type")]
-    code = next((kind for kind in kinds if isinstance(kind, str)), "")
-    message = body.get("message") if isinstance(body.get("message"), str) else ""
-    violations = body.get("safety_violations")
-    if isinstance(violations, list) and violations:
-        message = f"{message} [{', '.join(map(str, violations))}]"
-    return http_error(
-        error.status_code,
-        code,
-        str(message),
-        key_variable=config.key_variable,
-        wait_s=retry_after_s(error.response.headers),
-    )
 
 
 def _picture_of(content: Mapping[str, Any], config: OpenAIConfig) -> bytes:

@@ -1,0 +1,1 @@
+"""Services on the network that cost something: how they are asked, and what becomes of what they say."""
