@@ -20,7 +20,6 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.catalogue import Views, metric_named
 from sceneexpander.catalogue.metrics import metrics_named
-from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.ghosting import find_ghosting
 from sceneexpander.evaluation.image import psnr, ssim
@@ -135,12 +134,6 @@ def _seen(reconstruction: Reconstruction, index: int, views: ViewSet, place: int
         valid = None
     camera = (reconstruction.world_from_cam[index : index + 1], reconstruction.intrinsics_px[index : index + 1])
     seen = render(reconstruction.gaussians, *camera, *picture.shape[1:])
-    if not bool(torch.isfinite(seen.rgb).all()):
-        raise UserError(
-            f"shows view {reconstruction.view_ids[index]!a} with values that are not finite",
-            where=f"the reconstruction of {reconstruction.method}",
-            fix="make it anew: it cannot be measured",
-        )
     return SeenView(
         reconstruction=reconstruction,
         index=index,

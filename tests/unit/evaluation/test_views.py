@@ -153,16 +153,6 @@ def test_sizes_must_agree() -> None:
         preservation(scene, smaller, CONFIG)
 
 
-def test_a_render_that_is_not_finite_is_refused_by_the_views_name() -> None:
-    scene = made_reconstruction()
-    views = own_pictures(scene)
-    sh = scene.gaussians.sh.clone()
-    sh[scene.gaussians.source_view == 1] = float("nan")
-    broken = dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, sh=sh))
-    with pytest.raises(UserError, match=r"shows view '00[01]' with values that are not finite"):
-        preservation(broken, views, CONFIG)
-
-
 def test_row_holds_everything_and_survives_the_disk(tmp_path: Path) -> None:
     scene = made_reconstruction()
     navigation = Navigation(
