@@ -17,6 +17,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.earlier import EarlierRegions
 from sceneexpander.evaluation.measure import Measure, Navigation, Subject, Values, known_values
 from sceneexpander.evaluation.sizes import AtOtherSizes
+from sceneexpander.evaluation.tour import TourConsistency
 from sceneexpander.evaluation.truth import TruthMetrics, against_truth
 from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverage, measure_views
 
@@ -51,6 +52,7 @@ MEASURES: list[Measure] = [
     AtOtherSizes(),
     TourCoverage(),
     EarlierRegions(),
+    TourConsistency(),
     AgainstTruth(),
     Counts(),
 ]

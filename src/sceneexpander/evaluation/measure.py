@@ -6,6 +6,7 @@ outside the package is registered by `register_measure`. Its number is then in e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -92,9 +93,11 @@ class Measure(Protocol):
 
 
 def known_values(measure: Measure, values: Values) -> dict[str, float]:
-    """What is defined of an answer. Raises `ValueError` for a number that the measure does not declare."""
+    """What is defined of an answer. Raises `ValueError` for a number that the measure does not declare, or that is not finite."""
     declared = {metric.name for metric in measure.metrics}
-    for name in values:
+    for name, value in values.items():
         if name not in declared:
             raise ValueError(f"{type(measure).__name__} answers with {name!r}, which is none of its metrics")
+        if value is not None and not math.isfinite(value):
+            raise ValueError(f"{type(measure).__name__} answers {name} = {value}, which is no number to average")
     return {name: float(value) for name, value in values.items() if value is not None}

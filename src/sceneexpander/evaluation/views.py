@@ -21,6 +21,7 @@ from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.catalogue import Views, metric_named
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.ghosting import find_ghosting
 from sceneexpander.evaluation.image import psnr, ssim
 from sceneexpander.evaluation.measure import Measure, SeenView, Subject, Values, known_values
 from sceneexpander.evaluation.perceptual import st_lpips
@@ -135,13 +136,14 @@ def see_view(
     if valid is not None and int(valid.sum()) < _FEWEST_PIXELS:
         valid = None
     camera = (reconstruction.world_from_cam[index : index + 1], reconstruction.intrinsics_px[index : index + 1])
+    seen = render(reconstruction.gaussians, *camera, *picture.shape[1:])
     return SeenView(
         reconstruction=reconstruction,
         index=index,
         picture=picture,
         photo=views.photo(place),
         valid=valid,
-        render=render(reconstruction.gaussians, *camera, *picture.shape[1:]),
+        render=seen,
         config=config,
     )
 
@@ -194,15 +196,20 @@ class AtStoredSize(Measure):
 class FromOthers(Measure):
     """A view painted only by Gaussians that came from *other* views, over the pixels that those cover.
 
-    A picture that agrees with its neighbours scores high, doubled contours (ghosting) score low.
+    A picture that agrees with its neighbours scores high, doubled contours (ghosting) score low. Ghosting itself: `find_ghosting`.
     """
 
-    _captured = ("covered_by_others", "psnr_from_others_db")
-    _inserted = ("inserted_covered_by_others", "psnr_inserted_from_others_db")
+    _captured = ("covered_by_others", "psnr_from_others_db", "structure_ghosted", "structure_offset")
+    _inserted = (
+        "inserted_covered_by_others",
+        "psnr_inserted_from_others_db",
+        "inserted_structure_ghosted",
+        "inserted_structure_offset",
+    )
     metrics = metrics_named(*_captured, *_inserted)
 
     def of_view(self, view: SeenView) -> Values:
-        """Share that is covered, and the PSNR there; nothing for the only view."""
+        """Share that is covered, PSNR and ghosting there; nothing for the only view."""
         whole = view.reconstruction
         if not view.config.cross_view or len(whole.view_ids) < 2:
             return {}
@@ -210,18 +217,24 @@ class FromOthers(Measure):
         found = self._seen_by(others, view)
         return dict(zip(self._inserted if view.generated else self._captured, found, strict=True))
 
-    def _seen_by(self, others: Gaussians, view: SeenView) -> tuple[float, float | None]:
+    def _seen_by(self, others: Gaussians, view: SeenView) -> tuple[float | None, ...]:
         if not len(others):
-            return 0.0, None
+            return 0.0, None, None, None
         whole, index, counted = view.reconstruction, view.index, _counted(view)
         camera = (whole.world_from_cam[index : index + 1], whole.intrinsics_px[index : index + 1])
         seen = render(others, *camera, *view.picture.shape[1:])
         covered = (seen.alpha[0] > view.config.coverage_alpha) & counted
         if int(covered.sum()) < _FEWEST_PIXELS:
-            return _share(covered, counted), None
+            return _share(covered, counted), None, None, None
         # Divided by alpha: what is compared is the colour that is there, not the black behind it.
         colour = seen.rgb[0] / seen.alpha[0].clamp(min=1e-6)
-        return _share(covered, counted), min(psnr(colour, view.picture, covered), PSNR_CAP_DB)
+        ghosts = find_ghosting(view.picture, colour, covered) if view.config.ghosting else None
+        return (
+            _share(covered, counted),
+            min(psnr(colour, view.picture, covered), PSNR_CAP_DB),
+            None if ghosts is None else ghosts.ghosted,
+            None if ghosts is None else ghosts.offset,
+        )
 
 
 class TourCoverage(Measure):

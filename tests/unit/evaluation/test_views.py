@@ -164,6 +164,12 @@ def test_row_holds_everything_and_survives_the_disk(tmp_path: Path) -> None:
     assert row.value("gaussians_generated") == HEIGHT * WIDTH
     assert row.value("psnr_inserted_db") == PSNR_CAP_DB
     assert row.value("depth_abs_rel") is None
+    assert row.value("tour_registered") is not None
+    unmeasured = dataclasses.replace(CONFIG, consistency_frames=0)
+    without = evaluate(
+        scene, own_pictures(scene), unmeasured, scene="made", round_number=1, seed=0, navigation=navigation
+    )
+    assert without.value("tour_registered") is None
     assert row.numbers()["psnr_captured_db"] == PSNR_CAP_DB
     assert set(row.values) <= {metric.name for metric in measured_metrics()}
     assert "torch" in row.versions
