@@ -69,6 +69,16 @@ def proposals(scene: str, number: int) -> Path:
     return round_folder(scene, number) / "proposals"
 
 
+def held_out(scene: str) -> Path:
+    """The `HeldOut` photos as prepared: of the stages, only the one that matches them reads it."""
+    return OUTPUTS / scene / "held_out"
+
+
+def matched_held_out(scene: str) -> Path:
+    """The `HeldOut` photos with what ties them to the captured ones."""
+    return OUTPUTS / scene / "matched_held_out"
+
+
 def truth(scene: str) -> Path:
     """What is known of the truth, a `SceneTruth`; empty without any."""
     return OUTPUTS / scene / "truth"

@@ -53,7 +53,7 @@ class Views(StrEnum):
     CAPTURED = "captured"  # the mean over those that have a camera
     INSERTED = "inserted"  # the one of the row's round
     EARLIER = "earlier"  # captured and inserted ones that are older than the row's round
-    HELD_OUT = "held_out"  # at true cameras that no method was given
+    HELD_OUT = "held_out"  # that no method was given
     TOUR = "tour"  # the frames of the camera path
     NONE = "none"  # the reconstruction or the run as a whole
 
@@ -201,7 +201,8 @@ def _at_size(
 _CAPTURED = Scope(views=Views.CAPTURED)
 _INSERTED = Scope(views=Views.INSERTED)
 _EARLIER = Scope(views=Views.EARLIER)
-_HELD_OUT = Scope(views=Views.HELD_OUT, region=Region.NEW)
+_HELD_OUT = Scope(views=Views.HELD_OUT)
+_NEW_HELD_OUT = Scope(views=Views.HELD_OUT, region=Region.NEW)
 _WHOLE = Scope(views=Views.NONE)
 _TOUR = Scope(views=Views.TOUR)
 
@@ -268,6 +269,52 @@ QUALITY = (
         "captured_quadruple_size",
         "{}, four times the stored size",
         ("", "", "", "The share that one looks through when the pictures are drawn at four times the stored size."),
+    ),
+    Metric(
+        name="psnr_held_out_db",
+        group=Group.QUALITY,
+        title="PSNR of held-out photos",
+        scope=_HELD_OUT,
+        unit="dB",
+        better="higher",
+        meaning="Photos that nothing was made from, each at the camera found for it afterwards; all other PSNRs of photos are of "
+        "pictures that the method was given.",
+        shown=Shown.PAGE,
+    ),
+    Metric(
+        name="ssim_held_out",
+        group=Group.QUALITY,
+        title="SSIM of held-out photos",
+        scope=_HELD_OUT,
+        digits=3,
+        better="higher",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="st_lpips_held_out",
+        group=Group.QUALITY,
+        title="ST-LPIPS of held-out photos",
+        scope=_HELD_OUT,
+        digits=4,
+        better="lower",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="psnr_held_out_covered_db",
+        group=Group.QUALITY,
+        title="PSNR of held-out photos where covered",
+        scope=_HELD_OUT,
+        unit="dB",
+        better="higher",
+    ),
+    Metric(
+        name="held_out_covered",
+        group=Group.QUALITY,
+        title="Held-out photos covered",
+        scope=_HELD_OUT,
+        unit="%",
+        digits=1,
+        better="higher",
     ),
     Metric(
         name="psnr_from_others_db",
@@ -533,7 +580,7 @@ INSERTION = (
         name="psnr_new_region_db",
         group=Group.INSERTION,
         title="New-region PSNR",
-        scope=_HELD_OUT,
+        scope=_NEW_HELD_OUT,
         unit="dB",
         better="higher",
         meaning="What no captured view sees, at the true intended camera, against the consistent picture; black where nothing is drawn.",
@@ -543,7 +590,7 @@ INSERTION = (
         name="new_region_drawn",
         group=Group.INSERTION,
         title="New region drawn",
-        scope=_HELD_OUT,
+        scope=_NEW_HELD_OUT,
         unit="%",
         digits=1,
         better="higher",
@@ -554,7 +601,7 @@ INSERTION = (
         name="new_region_drawn_abs_rel",
         group=Group.INSERTION,
         title="New region's drawn depth error",
-        scope=_HELD_OUT,
+        scope=_NEW_HELD_OUT,
         unit="%",
         digits=1,
         better="lower",
@@ -687,6 +734,8 @@ COUNTS = (
     _count("views_captured", "Captured views"),
     _count("views_captured_posed", "Captured views with a pose"),
     _count("views_generated", "Generated views"),
+    _count("views_held_out", "Held-out photos", _HELD_OUT),
+    _count("views_held_out_posed", "Held-out photos with a pose", _HELD_OUT),
     _count("gaussians", "Gaussians"),
     _count("gaussians_generated", "Gaussians from generated views"),
     _count("tour_frames", "Frames of the tour", _TOUR),

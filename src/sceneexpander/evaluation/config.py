@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from sceneexpander.errors import UserError
 from sceneexpander.ranges import OpenShare, Range, check_ranges
@@ -18,6 +18,7 @@ class EvaluateConfig:
         cross_view: also compare each view with what the other views' Gaussians show (one more rendering per view).
         ghosting: with ``cross_view``, also look the photos' structure up in what the other views show.
         consistency_frames: frames of the camera path on which registration, cameras, TSED and steadiness are measured; 0: not at all.
+        hold_out: photos that are left out of everything and measured on; ``auto``: one of five or more.
         st_lpips: also the perceptual distance, where the package ``stlpips-pytorch`` is installed.
     """
 
@@ -25,6 +26,7 @@ class EvaluateConfig:
     cross_view: bool = True
     ghosting: bool = True
     consistency_frames: Annotated[int, Range(0, 64)] = 8
+    hold_out: Annotated[int, Range(0, 1000)] | Literal["auto"] = "auto"
     st_lpips: bool = True
 
     def __post_init__(self) -> None:

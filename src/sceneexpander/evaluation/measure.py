@@ -63,28 +63,56 @@ class SeenView:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class UnseenView:
+    """A photo that nothing was made from, and what the reconstruction shows at its camera (`evaluation.held_out`).
+
+    Attributes:
+        picture: the photo at the stored size.
+        photo: the same in its own pixels.
+        valid: stored pixels that show the place; None: all.
+        render: the reconstruction at the photo's camera and the stored size, on black.
+        config: settings.
+    """
+
+    picture: Float[Tensor, "3 height width"]
+    photo: Float[Tensor, "3 photo_height photo_width"]
+    valid: Bool[Tensor, "height width"] | None
+    render: Render
+    config: EvaluateConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Subject:
-    """What is measured: a reconstruction, its views' pictures, the camera path it is shown on, and known truth where there is any."""
+    """What is measured: a reconstruction, its views' pictures, the camera path it is shown on, and known truth where there is any.
+
+    ``seen`` are all its views, in its order.
+    """
 
     reconstruction: Reconstruction
     views: ViewSet
     round_number: int
     config: EvaluateConfig
+    seen: tuple[SeenView, ...]
     navigation: Navigation | None = None
     truth: SceneTruth | None = None
 
 
 class Measure(Protocol):
-    """Something that measures reconstructions: view by view, as a whole, or both.
+    """Something that measures reconstructions: view by view, on held-out photos, as a whole, or all of these.
 
     Of numbers of captured views the row has the mean over those with a camera, and none where one of these has none; numbers of inserted
-    views are in the row for the view of its round. ``metrics`` are all that the measure can answer with.
+    views are in the row for the view of its round; of held-out photos it has the mean if all of them have a camera. ``metrics`` are all
+    that the measure can answer with.
     """
 
     metrics: tuple[Metric, ...]
 
     def of_view(self, view: SeenView) -> Values:
         """Numbers of one view."""
+        return {}
+
+    def of_held_out(self, view: UnseenView) -> Values:
+        """Numbers of one photo that nothing was made from."""
         return {}
 
     def of_scene(self, subject: Subject) -> Values:

@@ -84,50 +84,56 @@ def same_place(
 
 
 @torch.no_grad()
-def measure_views(
-    reconstruction: Reconstruction,
-    views: ViewSet,
-    config: EvaluateConfig,
-    measures: Sequence[Measure],
-    *,
-    generated: bool,
-) -> tuple[ViewMetrics, ...]:
-    """One row per captured (or generated) view of the reconstruction, in order: rendered there and measured.
+def see_views(reconstruction: Reconstruction, views: ViewSet, config: EvaluateConfig) -> tuple[SeenView, ...]:
+    """Every view of the reconstruction, drawn at its own camera, beside its picture.
 
     Raises:
-        ValueError: a picture is missing or of another size, or a measure mixes up captured and inserted views.
+        ValueError: a picture is missing or of another size.
     """
     if reconstruction.depth.shape[1:] != views.images.shape[2:]:
         raise ValueError(
             f"the reconstruction has {tuple(reconstruction.depth.shape[1:])} pixels, the views {views.height, views.width}"
         )
     picture_of = {record.view_id: i for i, record in enumerate(views.records)}
-    rows = []
-    for index, view_id in enumerate(reconstruction.view_ids):
-        if bool(reconstruction.generated[index]) != generated:
-            continue
+    for view_id in reconstruction.view_ids:
         if view_id not in picture_of:
             raise ValueError(f"no picture of view {view_id!r} was given, only {list(picture_of)}")
-        seen = see_view(reconstruction, index, views, picture_of[view_id], config)
+    return tuple(
+        _see_view(reconstruction, index, views, picture_of[view_id], config)
+        for index, view_id in enumerate(reconstruction.view_ids)
+    )
+
+
+@torch.no_grad()
+def measure_views(seen: Sequence[SeenView], measures: Sequence[Measure], *, generated: bool) -> tuple[ViewMetrics, ...]:
+    """One row per captured (or generated) view, in order.
+
+    Raises:
+        ValueError: a measure mixes up captured and inserted views.
+    """
+    rows = []
+    kind = Views.INSERTED if generated else Views.CAPTURED
+    for view in seen:
+        if view.generated != generated:
+            continue
         values: dict[str, float] = {}
         for measure in measures:
-            values |= known_values(measure, measure.of_view(seen))
-        kind = Views.INSERTED if generated else Views.CAPTURED
+            values |= known_values(measure, measure.of_view(view))
         for name in values:
             if metric_named(name).scope.views is not kind:
                 raise ValueError(f"{name!r} is not a metric of {kind} views")
         rows.append(
             ViewMetrics(
-                view_id=view_id,
+                view_id=view.reconstruction.view_ids[view.index],
                 generated=generated,
-                posed=bool(reconstruction.posed[index]),
+                posed=bool(view.reconstruction.posed[view.index]),
                 values=values,
             )
         )
     return tuple(rows)
 
 
-def see_view(
+def _see_view(
     reconstruction: Reconstruction, index: int, views: ViewSet, place: int, config: EvaluateConfig
 ) -> SeenView:
     """A view of a reconstruction drawn at its own camera, beside its picture, which is the one at ``place`` in ``views``."""

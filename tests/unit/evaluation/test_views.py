@@ -19,7 +19,7 @@ from sceneexpander.evaluation.evaluate import MEASURES, evaluate
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.measure import Navigation
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
-from sceneexpander.evaluation.views import measure_views, navigation_coverage, same_place
+from sceneexpander.evaluation.views import measure_views, navigation_coverage, same_place, see_views
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from tests.unit.evaluation.made import HEIGHT, WIDTH, made_reconstruction, own_pictures, without_generated
@@ -28,11 +28,11 @@ CONFIG = EvaluateConfig()
 
 
 def preservation(scene: Reconstruction, views: ViewSet, config: EvaluateConfig) -> tuple[ViewMetrics, ...]:
-    return measure_views(scene, views, config, MEASURES, generated=False)
+    return measure_views(see_views(scene, views, config), MEASURES, generated=False)
 
 
 def insertion_fidelity(scene: Reconstruction, views: ViewSet, config: EvaluateConfig) -> tuple[ViewMetrics, ...]:
-    return measure_views(scene, views, config, MEASURES, generated=True)
+    return measure_views(see_views(scene, views, config), MEASURES, generated=True)
 
 
 def psnr_of(row: ViewMetrics) -> float:
@@ -258,7 +258,7 @@ def test_what_others_show_thinly_is_compared_by_its_colour() -> None:
     config = EvaluateConfig(st_lpips=False, coverage_alpha=0.2)
     pictures = own_pictures(scene)
     solid, seen = (
-        measure_views(one, pictures, config, MEASURES, generated=False)[0].values["psnr_from_others_db"]
+        measure_views(see_views(one, pictures, config), MEASURES, generated=False)[0].values["psnr_from_others_db"]
         for one in (scene, thin)
     )
     assert solid > 30
@@ -267,6 +267,6 @@ def test_what_others_show_thinly_is_compared_by_its_colour() -> None:
 
 def test_the_perceptual_distance_can_be_left_out() -> None:
     scene = made_reconstruction()
-    rows = measure_views(scene, own_pictures(scene), EvaluateConfig(st_lpips=False), MEASURES, generated=False)
+    rows = preservation(scene, own_pictures(scene), EvaluateConfig(st_lpips=False))
     assert rows
     assert not any("st_lpips_captured" in row.values for row in rows)
