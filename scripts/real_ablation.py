@@ -32,7 +32,7 @@ from sceneexpander.expansion import (
 from sceneexpander.generation import GenerationContext, check_round
 from sceneexpander.ingest import load_scene
 from sceneexpander.photometric.fitting import fit_to_views
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 

@@ -26,7 +26,7 @@ from sceneexpander.expansion import initial_state
 from sceneexpander.ingest import load_scene
 from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.refine import refine
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from sceneexpander.artifacts.held_out import HeldOut
 from sceneexpander.artifacts.state import ExpansionState
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.frontend.prior import FrontendConfig
 from stages import layout
 from stages.runner import Cell, stage, use_threads

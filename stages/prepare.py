@@ -6,10 +6,10 @@ import logging
 import shutil
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.config.files import read_sections
 from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.files import directory_being_written
 from sceneexpander.ingest import IngestConfig, hold_out, load_scene, recorded_files
 from sceneexpander.ingest.truth import load_truth
 from stages import layout

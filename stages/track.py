@@ -13,8 +13,8 @@ from pathlib import Path
 from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.errors import UserError, disk_full
-from sceneexpander.project import SWEEP_ENV
-from sceneexpander.selection import read_selection
+from sceneexpander.pipeline.project import SWEEP_ENV
+from sceneexpander.pipeline.selection import read_selection
 from sceneexpander.tracking import RunRecord, TrackingConfig, record_runs, scene_runs
 from stages import layout
 from stages.runner import Cell, project_root, stage

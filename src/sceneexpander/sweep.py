@@ -21,10 +21,10 @@ from sceneexpander.config.parse import ConfigError
 from sceneexpander.errors import UserError, did_you_mean, disk_full, entry_point
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.preflight import CHECKED_SECTIONS, Checked, check_scene
+from sceneexpander.pipeline.processes import run_group
+from sceneexpander.pipeline.project import ROOT_ENV, find_project
+from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, reproduce_shared
-from sceneexpander.processes import run_group
-from sceneexpander.project import ROOT_ENV, find_project
-from sceneexpander.selection import Selection, read_selection
 from sceneexpander.typed import shorten
 
 if TYPE_CHECKING:

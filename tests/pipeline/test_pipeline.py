@@ -21,8 +21,8 @@ from PIL import Image
 
 from sceneexpander.catalogue import METHODS as KNOWN
 from sceneexpander.catalogue.methods import CORRECTED
+from sceneexpander.pipeline.selection import Selection
 from sceneexpander.pipeline.workspace import make_workspace, workspace_environment
-from sceneexpander.selection import Selection
 from stages import layout
 
 pytestmark = pytest.mark.pipeline

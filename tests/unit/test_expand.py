@@ -31,7 +31,7 @@ from sceneexpander.generation import Forecast
 from sceneexpander.pipeline import preflight
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import CheckedScene
-from sceneexpander.selection import read_selection
+from sceneexpander.pipeline.selection import read_selection
 from tests.unit.ingest.test_survey import texture
 
 ROOT = Path(__file__).parents[2]
@@ -166,7 +166,7 @@ def test_a_killed_start_leaves_no_child_and_no_lock(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     script = f"""
 from pathlib import Path
-from sceneexpander.processes import kept
+from sceneexpander.pipeline.processes import kept
 from sceneexpander.pipeline.locks import run_lock
 with run_lock(Path({str(folder)!r})) as lock:
     with kept(["sleep", "60"], cwd=Path({str(tmp_path)!r}), held=(lock.descriptor,)) as process:

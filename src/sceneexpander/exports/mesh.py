@@ -18,11 +18,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.errors import UserError
 from sceneexpander.exports.gltf import glb_bytes, load_trimesh
 from sceneexpander.exports.scene import ExportScene
 from sceneexpander.exports.statement import Statement
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.lookup import project_to_views, sample_at
 from sceneexpander.geometry.rigid import rigid_inverse

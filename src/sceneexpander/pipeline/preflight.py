@@ -18,7 +18,7 @@ from sceneexpander.ingest import load_scene
 from sceneexpander.ingest.truth import check_truth
 from sceneexpander.judge import make_judge
 from sceneexpander.models.weights import HUB_ID
-from sceneexpander.project import GENERATED_FOLDER, JUDGED_FOLDER, find_project
+from sceneexpander.pipeline.project import GENERATED_FOLDER, JUDGED_FOLDER, find_project
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
 
 

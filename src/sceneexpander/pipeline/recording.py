@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from sceneexpander.config.files import read_yaml
-from sceneexpander.project import ROOT_ENV
+from sceneexpander.pipeline.project import ROOT_ENV
 from sceneexpander.tracking.store import database_path
 
 RECORDED = Path("mlflow") / "tracked.json"  # what the last stage leaves: of every scene which runs are recorded

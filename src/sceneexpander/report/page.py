@@ -10,9 +10,9 @@ from typing import Any
 
 from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
 from sceneexpander.artifacts.page import MethodPage, RoundPage, ScenePage, StageRun
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.catalogue import ARROWS, MAIN, Metric
 from sceneexpander.catalogue.methods import CAPTURED, known_method
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.report.cameras import cameras_shown
 from sceneexpander.report.course import FITTED, fits, looks_shown, verdict
 from sceneexpander.report.curve import curve_chart, objective_curves, smoothing_window

@@ -10,8 +10,9 @@ from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
-from sceneexpander.artifacts.store import ArtifactError, directory_being_written, sha256_of_tensors
+from sceneexpander.artifacts.store import ArtifactError, sha256_of_tensors
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
+from sceneexpander.files import directory_being_written
 from sceneexpander.geometry.gaussians import GaussianCounts
 from sceneexpander.geometry.priors import Priors
 from tests.support.tiny_model import TinyReconstructor, tiny_images

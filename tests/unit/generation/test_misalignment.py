@@ -11,7 +11,7 @@ from PIL import Image
 
 from sceneexpander.artifacts.agreement import MisalignmentReport
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
-from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.files import directory_being_written
 from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.misalignment import report_misalignment

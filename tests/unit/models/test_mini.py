@@ -20,9 +20,12 @@ from sceneexpander.models.mini import Mini, MiniConfig
 from sceneexpander.models.mini.inputs import working_size
 from sceneexpander.models.mini.pairs import PairGeometry, splat_log_depth
 from sceneexpander.models.mini.splats import covered_by_others
-from sceneexpander.models.mini.training.augment import augment, mirrored
-from sceneexpander.models.mini.training.buffer import samples_folder
-from sceneexpander.models.mini.training.generate import (
+from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor
+from sceneexpander.models.registry import build_reconstructor
+from sceneexpander.synthetic.views import make_views
+from sceneexpander.training.augment import augment, mirrored
+from sceneexpander.training.buffer import samples_folder
+from sceneexpander.training.generate import (
     Conditions,
     GeneratorConfig,
     in_scale_of_base,
@@ -31,20 +34,17 @@ from sceneexpander.models.mini.training.generate import (
     sample_of_scene,
     training_sample,
 )
-from sceneexpander.models.mini.training.losses import (
+from sceneexpander.training.losses import (
     confidence_loss,
     depth_loss,
     log_depth_error,
     render_loss,
     scale_loss,
 )
-from sceneexpander.models.mini.training.measure import geometry_row
-from sceneexpander.models.mini.training.sample import Sample
-from sceneexpander.models.mini.training.scores import scene_samples
-from sceneexpander.models.mini.training.trainer import LossWeights, TrainConfig, Trainer
-from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor
-from sceneexpander.models.registry import build_reconstructor
-from sceneexpander.synthetic.views import make_views
+from sceneexpander.training.measure import geometry_row
+from sceneexpander.training.sample import Sample
+from sceneexpander.training.scores import scene_samples
+from sceneexpander.training.trainer import LossWeights, TrainConfig, Trainer
 
 TINY = MiniConfig(
     work_px=64,
@@ -505,8 +505,8 @@ def test_the_first_view_of_an_augmented_sample_has_a_pose(held_out: list[Sample]
 
 
 def test_kept_samples_of_a_scored_scene_are_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sceneexpander.models.mini.training.scores.HEIGHT", 112)
-    monkeypatch.setattr("sceneexpander.models.mini.training.scores.WIDTH", 168)
+    monkeypatch.setattr("sceneexpander.training.scores.HEIGHT", 112)
+    monkeypatch.setattr("sceneexpander.training.scores.WIDTH", 168)
     first = scene_samples(5, noisy=True, front_end=False, kept=tmp_path)
     assert first.own_cameras is None
     assert sorted(path.name for path in tmp_path.iterdir()) == ["5_noisy.safetensors", "5_true.safetensors"]
@@ -514,7 +514,7 @@ def test_kept_samples_of_a_scored_scene_are_used_again(tmp_path: Path, monkeypat
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("made again")
 
-    monkeypatch.setattr("sceneexpander.models.mini.training.scores.sample_of_scene", refuse)
+    monkeypatch.setattr("sceneexpander.training.scores.sample_of_scene", refuse)
     again = scene_samples(5, noisy=True, front_end=False, kept=tmp_path)
     assert torch.equal(again.true_cameras.prior_log_depth, first.true_cameras.prior_log_depth)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sceneexpander.errors import UserError
+from sceneexpander.files import complete_file
 from sceneexpander.geometry.camera import camera_vector_from_pose, pose_from_camera_vector, unproject_to_world
 from sceneexpander.geometry.normals import face_camera, viewing_rays
 from sceneexpander.geometry.priors import Priors
@@ -192,12 +192,8 @@ class Mini(nn.Module):
     def save_weights(self, path: Path) -> None:
         """Write the weights in half precision with the configuration, atomically."""
         tensors = {name: value.detach().half().contiguous() for name, value in self.state_dict().items()}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        save_file(tensors, scratch, {_CONFIG_KEY: json.dumps(self.config.to_dict())})
-        with scratch.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(scratch, path)
+        with complete_file(path) as scratch:
+            save_file(tensors, scratch, {_CONFIG_KEY: json.dumps(self.config.to_dict())})
 
     def _cameras(
         self, tokens: Float[Tensor, "view dim"], priors: MeasuredPriors, scene_scale: float, height: int, width: int

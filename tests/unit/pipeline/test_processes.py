@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander.processes import kept, run_group
+from sceneexpander.pipeline.processes import kept, run_group
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 # Starts a grandchild, writes down who they are, and then does what is asked for.
 CHILD = (
     "import os, subprocess, sys, time; p = subprocess.Popen(['sleep', '60']); "
@@ -27,7 +27,7 @@ from collections.abc import Callable
 from pathlib import Path
 sys.path.insert(0, {src!r})
 from sceneexpander.errors import entry_point
-from sceneexpander.processes import run_group
+from sceneexpander.pipeline.processes import run_group
 @entry_point
 def main():
     raise SystemExit(run_group([sys.executable, "-c", {child!r}], cwd=Path.cwd()))
@@ -139,7 +139,7 @@ def test_output_and_environment_pass_through(tmp_path: Path) -> None:
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from sceneexpander.processes import run_group
+from sceneexpander.pipeline.processes import run_group
 run_group([sys.executable, "-c", {child!r}], cwd=Path.cwd(), env={{"GIVEN": "hello"}})
 """
     done = subprocess.run(

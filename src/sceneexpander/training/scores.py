@@ -15,19 +15,19 @@ from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.models.mini.model import Mini
-from sceneexpander.models.mini.training.buffer import samples_folder
-from sceneexpander.models.mini.training.generate import (
+from sceneexpander.models.protocol import ALL_HEADS, Head
+from sceneexpander.splatting import render
+from sceneexpander.synthetic.views import SyntheticViews, make_views
+from sceneexpander.training.buffer import samples_folder
+from sceneexpander.training.generate import (
     PHOTO_SUPERSAMPLE,
     Conditions,
     input_photos,
     own_cameras_sample,
     sample_of_scene,
 )
-from sceneexpander.models.mini.training.measure import geometry_row, mean_row
-from sceneexpander.models.mini.training.sample import Sample
-from sceneexpander.models.protocol import ALL_HEADS, Head
-from sceneexpander.splatting import render
-from sceneexpander.synthetic.views import SyntheticViews, make_views
+from sceneexpander.training.measure import geometry_row, mean_row
+from sceneexpander.training.sample import Sample
 
 _LOG = logging.getLogger(__name__)
 HEIGHT, WIDTH = 280, 336  # the working size of the front-end

@@ -83,7 +83,7 @@ def test_a_computed_import_must_be_declared(tree: SourceTree) -> None:
 
 
 def test_the_projects_own_stages_have_a_closure() -> None:
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     ours = SourceTree(packages={"sceneexpander": root / "src" / "sceneexpander", "stages": root / "stages"})
     adapt, prepare = ours.closure("stages.adapt"), ours.closure("stages.prepare")
     assert {"sceneexpander.adaptation.loop", "sceneexpander.models.registry", "stages.runner"} <= set(adapt)
@@ -93,7 +93,7 @@ def test_the_projects_own_stages_have_a_closure() -> None:
 
 
 def test_the_rasterisers_source_and_flags_are_code_of_all_that_render(tmp_path: Path) -> None:
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     shutil.copytree(root / "src" / "sceneexpander", tmp_path / "sceneexpander", ignore=shutil.ignore_patterns("*.so"))
     ours = SourceTree(packages={"sceneexpander": tmp_path / "sceneexpander", "stages": root / "stages"})
     stages = (
@@ -116,7 +116,7 @@ def test_the_rasterisers_source_and_flags_are_code_of_all_that_render(tmp_path: 
 
 
 def test_an_edit_of_the_adaptation_reruns_no_reconstructor() -> None:
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     ours = SourceTree(packages={"sceneexpander": root / "src" / "sceneexpander", "stages": root / "stages"})
 
     def adaptation(stage: str) -> set[str]:
@@ -134,7 +134,7 @@ def test_an_edit_of_the_adaptation_reruns_no_reconstructor() -> None:
 
 @pytest.mark.parametrize("stage", ["prepare", "generate_view", "reconstruct_inserted", "evaluate", "track"])
 def test_what_a_stage_imports_is_in_its_closure(stage: str) -> None:
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     ours = SourceTree(packages={"sceneexpander": root / "src" / "sceneexpander", "stages": root / "stages"})
     program = f"import stages.{stage}, sys; print(*(n for n in sys.modules if n.split('.')[0] in ('sceneexpander', 'stages')))"
     done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True)

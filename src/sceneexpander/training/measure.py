@@ -12,8 +12,8 @@ from torch import Tensor
 from sceneexpander.geometry.camera import resize_intrinsics
 from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.rigid import rotation_angle_deg
-from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.protocol import GEOMETRY_HEADS, Prediction, Reconstructor
+from sceneexpander.training.sample import Sample
 
 _D_THRESHOLD = torch.tensor(1.25).log().item()
 

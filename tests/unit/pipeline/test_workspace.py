@@ -7,10 +7,10 @@ import yaml
 
 from sceneexpander.errors import UserError
 from sceneexpander.expand import parse_arguments, stage_scene
+from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, merged_overrides
-from sceneexpander.selection import Selection, read_selection
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def test_a_workspace_is_a_pipeline_folder_with_its_own_selection(tmp_path: Path) -> None:

@@ -11,13 +11,13 @@ from torch import Tensor
 from sceneexpander.frontend.dense import DenseConfig, dense_depth
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig
-from sceneexpander.frontend.simulated import perturb_poses, sample_sparse_points
 from sceneexpander.frontend.sparse_points import SparsePoints
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 from sceneexpander.geometry.rigid import rigid_inverse
-from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.synthetic.textures import Split
 from sceneexpander.synthetic.views import SyntheticViews, make_views
+from sceneexpander.training.sample import Sample
+from sceneexpander.training.simulated import perturb_poses, sample_sparse_points
 
 PHOTO_SCALE = 2  # photos over working size, as the pipeline keeps them (`scene.detail_scale`)
 PHOTO_SUPERSAMPLE = 1.0  # colour samples per pixel side when training scenes are drawn as photos

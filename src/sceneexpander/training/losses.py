@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from sceneexpander.geometry.camera import camera_vector_from_pose
-from sceneexpander.models.mini.training.sample import Sample
 from sceneexpander.models.protocol import Prediction
+from sceneexpander.training.sample import Sample
 
 FARTHEST = 12.0  # pixels beyond this multiple of the scene's median depth carry no depth loss
 _NEAR, _NEAR_WEIGHT = 0.2, 0.5  # of the saturating term: it weighs as much as |log error| up to about this error

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from sceneexpander.frontend.confidence import RIGHT, ConfidenceModel, confidence_features
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
-from sceneexpander.models.mini.training.sample import Sample
+from sceneexpander.training.sample import Sample
 
 _RIDGE = 1e-5  # per squared standardised weight
 

@@ -31,7 +31,7 @@ def find_project() -> Path:
             raise UserError("holds no pipeline (dvc.yaml and conf/)", where=f"{ROOT_ENV}={named}", fix="unset it")
         return root
     here = Path.cwd().resolve()
-    for folder in (here, *here.parents, Path(__file__).resolve().parents[2]):
+    for folder in (here, *here.parents, Path(__file__).resolve().parents[3]):
         if _holds_pipeline(folder):
             return folder
     raise UserError("holds no pipeline (dvc.yaml and conf/)", where=here, fix="run this in the project folder")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from sceneexpander.errors import UserError
+from sceneexpander.files import complete_file
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.geometry.rigid import rigid_inverse
@@ -142,10 +142,9 @@ class Sample:
         for name in ("log_depth", "prior_log_depth", "sparse_log_depth", "evidence"):
             tensors[name] = tensors[name].half()
         facts = {"schema": _SCHEMA, "wrong_focal": self.wrong_focal, "kind": self.kind, "seed": self.seed}
-        scratch = path.with_suffix(f".{os.getpid()}.partial")
         contiguous = {name: value.contiguous() for name, value in tensors.items()}
-        save_file(contiguous, scratch, metadata={"sample": json.dumps(facts)})
-        os.replace(scratch, path)
+        with complete_file(path) as scratch:
+            save_file(contiguous, scratch, metadata={"sample": json.dumps(facts)})
 
     @classmethod
     def load(cls, path: Path) -> Sample:

@@ -23,8 +23,9 @@ class Environment:
 
     def identify(self, tree: SourceTree, module: str) -> str:
         """Hash of a module's code together with the environment that it runs in; the rasteriser's build counts for those that draw."""
-        parts = [tree.fingerprint(module), self.packages]
-        if _RENDERER in tree.closure(module):
+        modules = tree.closure(module)
+        parts = [tree.fingerprint_of(modules), self.packages]
+        if _RENDERER in modules:
             parts.append(self.kernel)
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 

@@ -14,7 +14,7 @@ from sceneexpander.expansion import ModelConfig
 from sceneexpander.pipeline import preflight
 from sceneexpander.pipeline.preflight import Checked, check_device, check_scene, check_weights
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.parametrize("spec", ["org/name@rev", "org/name@main", "some-org/some.model@0123abc"])

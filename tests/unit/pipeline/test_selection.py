@@ -10,10 +10,10 @@ import yaml
 
 from sceneexpander.catalogue import METHODS
 from sceneexpander.errors import UserError
-from sceneexpander.selection import RESERVED, Selection, check_name, read_selection
+from sceneexpander.pipeline.selection import RESERVED, Selection, check_name, read_selection
 from stages import layout
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 GOOD = {
     "scenes": "[courtyard]",
     "rounds": "[{k: 1, prev: 0}]",

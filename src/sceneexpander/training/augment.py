@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from sceneexpander.models.mini.training.sample import Sample
+from sceneexpander.training.sample import Sample
 
 
 def augment(sample: Sample, generator: torch.Generator) -> Sample:

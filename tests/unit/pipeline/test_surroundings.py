@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneexpander.errors import UserError
+from sceneexpander.pipeline.selection import Selection
 from sceneexpander.pipeline.surroundings import local_config, pipeline_environment, settle_project
 from sceneexpander.pipeline.workspace import make_workspace, workspace_environment
-from sceneexpander.selection import Selection
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 FOLDERS = [
     "a,b",
     "a#b",

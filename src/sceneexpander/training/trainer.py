@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
@@ -17,11 +16,14 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from sceneexpander.files import complete_file
 from sceneexpander.models.mini.config import MiniConfig
 from sceneexpander.models.mini.model import Mini
-from sceneexpander.models.mini.training.augment import augment
-from sceneexpander.models.mini.training.buffer import BufferReader, stored_indices
-from sceneexpander.models.mini.training.losses import (
+from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Prediction
+from sceneexpander.splatting import render
+from sceneexpander.training.augment import augment
+from sceneexpander.training.buffer import BufferReader, stored_indices
+from sceneexpander.training.losses import (
     camera_loss,
     confidence_loss,
     depth_loss,
@@ -32,10 +34,8 @@ from sceneexpander.models.mini.training.losses import (
     scale_loss,
     supervised_pixels,
 )
-from sceneexpander.models.mini.training.measure import geometry_row, mean_row
-from sceneexpander.models.mini.training.sample import Sample
-from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Prediction
-from sceneexpander.splatting import render
+from sceneexpander.training.measure import geometry_row, mean_row
+from sceneexpander.training.sample import Sample
 
 _LOG = logging.getLogger(__name__)
 CHECKPOINT = "checkpoint.safetensors"
@@ -296,11 +296,9 @@ class Trainer:
             "model": self.model.config.to_dict(),
             "config": asdict(self.config),
         }
-        scratch = self.folder / f"{CHECKPOINT}.{os.getpid()}.partial"
-        save_file({name: value.contiguous() for name, value in tensors.items()}, scratch, {"state": json.dumps(facts)})
-        with scratch.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(scratch, self.folder / CHECKPOINT)
+        whole = {name: value.contiguous() for name, value in tensors.items()}
+        with complete_file(self.folder / CHECKPOINT) as scratch:
+            save_file(whole, scratch, {"state": json.dumps(facts)})
 
     def resume(self) -> bool:
         """Continue from the folder's checkpoint, if there is one."""

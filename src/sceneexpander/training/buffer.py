@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 
 from sceneexpander.errors import UserError
-from sceneexpander.models.mini.training.generate import GeneratorConfig, training_sample
-from sceneexpander.models.mini.training.sample import Sample
+from sceneexpander.training.generate import GeneratorConfig, training_sample
+from sceneexpander.training.sample import Sample
 
 _LOG = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""``python -m sceneexpander.repro``: the pipeline of the project folder itself, as ``make repro`` runs it.
+"""``python -m sceneexpander.pipeline.repro``: the pipeline of the project folder itself, as ``make repro`` runs it.
 
 ``dvc repro`` does the same in a clone; this also works in a downloaded archive, in a folder with any letters in its name, and ends all
 that it started when it ends.
@@ -11,9 +11,9 @@ import sys
 from sceneexpander.errors import entry_point
 from sceneexpander.pipeline.disk import require_room
 from sceneexpander.pipeline.locks import run_lock
+from sceneexpander.pipeline.processes import run_group
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.pipeline.surroundings import pipeline_environment, settle_project
-from sceneexpander.processes import run_group
-from sceneexpander.project import find_project
 
 
 @entry_point
