@@ -742,7 +742,26 @@ COUNTS = (
     _count("repeats", "Runs with other seeds"),
 )
 
-MEASURED = (*QUALITY, *INSERTION, *GEOMETRY, *COUNTS)
+# By a vision-language model, where one was asked: 1 to 5.
+JUDGED = (
+    Metric(
+        name="judge_insertion",
+        group=Group.INSERTION,
+        title="Judge: insertion satisfaction",
+        scope=_TOUR,
+        better="higher",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="judge_quality",
+        group=Group.QUALITY,
+        title="Judge: render quality",
+        scope=_TOUR,
+        better="higher",
+        shown=Shown.TABLE,
+    ),
+)
+MEASURED = (*QUALITY, *INSERTION, *GEOMETRY, *JUDGED, *COUNTS)
 _known = {metric.name: metric for metric in MEASURED}
 
 
