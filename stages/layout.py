@@ -38,8 +38,8 @@ def selection(scene: str) -> Path:
 def given(scene: str, kind: str) -> Path:
     """A folder of links to files that the configuration names, wherever they are: the pipeline depends on their bytes.
 
-    ``kind``: ``generator`` and ``choice`` (a folder per round), ``judge`` (a prompt per criterion), ``model`` (weights), or a rival's name
-    (weights).
+    ``kind``: ``generator`` and ``choice`` (a folder per round), ``judge`` (a prompt per criterion), ``lpips`` and ``model`` (weights), or a
+    rival's name (weights).
     """
     return GIVEN / scene / kind
 

@@ -742,6 +742,30 @@ COUNTS = (
     _count("repeats", "Runs with other seeds"),
 )
 
+
+def _looked(kind: str, title: str, digits: int) -> tuple[Metric, ...]:
+    """LPIPS or FLIP of each kind of views."""
+    places = (
+        ("captured", Group.QUALITY, _CAPTURED, "stored size", Shown.TABLE),
+        ("held_out", Group.QUALITY, _HELD_OUT, "held-out photos", Shown.TABLE),
+        ("inserted", Group.INSERTION, _INSERTED, "inserted view", Shown.TRACKED),
+    )
+    return tuple(
+        Metric(
+            name=f"{kind}_{name}",
+            group=group,
+            title=f"{title}, {where}",
+            scope=scope,
+            digits=digits,
+            better="lower",
+            shown=shown,
+        )
+        for name, group, scope, where, shown in places
+    )
+
+
+LOOKED = (*_looked("lpips", "LPIPS", 3), *_looked("flip", "FLIP", 3))
+
 # By a vision-language model, where one was asked: 1 to 5.
 JUDGED = (
     Metric(
@@ -761,7 +785,7 @@ JUDGED = (
         shown=Shown.TABLE,
     ),
 )
-MEASURED = (*QUALITY, *INSERTION, *GEOMETRY, *JUDGED, *COUNTS)
+MEASURED = (*QUALITY, *INSERTION, *GEOMETRY, *LOOKED, *JUDGED, *COUNTS)
 _known = {metric.name: metric for metric in MEASURED}
 
 

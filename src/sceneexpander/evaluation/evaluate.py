@@ -22,6 +22,7 @@ from sceneexpander.evaluation.sizes import AtOtherSizes
 from sceneexpander.evaluation.tour import TourConsistency
 from sceneexpander.evaluation.truth import TruthMetrics, against_truth
 from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverage, measure_views, see_views
+from sceneexpander.evaluation.visual import Visual
 
 NOTHING_HELD_OUT = HeldOut()
 
@@ -53,6 +54,7 @@ class AgainstTruth(Measure):
 MEASURES: list[Measure] = [
     AtStoredSize(),
     Unseen(),
+    Visual(),
     FromOthers(),
     AtOtherSizes(),
     TourCoverage(),

@@ -76,7 +76,7 @@ def filled(path: str) -> str:
                 layout.selection("S"),
                 *(
                     layout.given("S", kind)
-                    for kind in ("generator", "choice", "judge", "model", *methods_of(Kind.RIVAL))
+                    for kind in ("generator", "choice", "judge", "lpips", "model", *methods_of(Kind.RIVAL))
                 ),
             ],
         ),
@@ -173,7 +173,7 @@ def test_nothing_persists_but_what_belongs_to_this_machine() -> None:
     }
     given = {
         layout.given("S", kind).as_posix()
-        for kind in ("generator", "choice", "judge", "model", *methods_of(Kind.RIVAL))
+        for kind in ("generator", "choice", "judge", "lpips", "model", *methods_of(Kind.RIVAL))
     }
     # Never restored from the cache of runs (another machine's environment), never copied into it (links to the user's files).
     assert persistent == {"mlflow/tracked.json", layout.CODE.as_posix(), layout.ENVIRONMENT.as_posix()} | given
