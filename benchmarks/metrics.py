@@ -11,9 +11,10 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import MEASURES
-from sceneexpander.evaluation.measure import Navigation, Subject
+from sceneexpander.evaluation.measure import Subject
 from sceneexpander.evaluation.views import see_views
 from sceneexpander.geometry.camera import camera_vector_from_pose, unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.trajectory import navigation
 from sceneexpander.synthetic import make_views
@@ -79,7 +80,7 @@ def main() -> None:
     scene, views = made_scene(given.views, height, width)
     config = EvaluateConfig()
     poses, lenses = navigation(scene.world_from_cam, scene.intrinsics_px, given.frames, range(given.views))
-    path = Navigation(world_from_cam=poses, intrinsics_px=lenses, height=height, width=width)
+    path = Cameras(poses, lenses, height, width)
     total = started = time.process_time()
     with torch.no_grad():
         seen = see_views(scene, views, config)

@@ -138,3 +138,18 @@ def test_no_room_knows_the_pipeline(path: Path) -> None:
 
 def test_the_walk_sees_imports_at_all() -> None:
     assert "geometry" in rooms_imported(PACKAGE / "artifacts" / "reconstruction.py")
+
+
+TESTS = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("path", sorted(TESTS.rglob("*.py")), ids=lambda path: path.relative_to(TESTS).as_posix())
+def test_tests_share_worlds_and_support_but_do_not_import_each_other(path: Path) -> None:
+    found = [name for name in imports_of_tests(path) if ".test_" in name or name.startswith("tests.pipeline")]
+    assert not found, "what two tests need stands in tests/worlds or tests/support"
+
+
+def imports_of_tests(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("tests"):
+            yield node.module

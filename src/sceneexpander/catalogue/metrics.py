@@ -74,6 +74,7 @@ class Region(StrEnum):
     ALL = "all"
     OTHERS = "others"  # what Gaussians of other views cover
     NEW = "new"  # what no captured view sees
+    SEEN = "seen"  # what a captured view sees
     GAINED = "gained"  # what the insertion added to what was covered before it
 
 
@@ -766,6 +767,25 @@ def _looked(kind: str, title: str, digits: int) -> tuple[Metric, ...]:
 
 LOOKED = (*_looked("lpips", "LPIPS", 3), *_looked("flip", "FLIP", 3))
 
+# Where the new region is known.
+REGIONS = tuple(
+    Metric(
+        name=name,
+        group=Group.INSERTION,
+        title=title,
+        scope=Scope(views=Views.INSERTED, region=region),
+        unit=unit,
+        digits=digits,
+        better="higher",
+    )
+    for name, title, region, unit, digits in (
+        ("psnr_inserted_new_db", "PSNR of the inserted view's new region", Region.NEW, "dB", 2),
+        ("ssim_inserted_new", "SSIM of the inserted view's new region", Region.NEW, "", 3),
+        ("psnr_inserted_seen_db", "PSNR of the inserted view's seen region", Region.SEEN, "dB", 2),
+        ("ssim_inserted_seen", "SSIM of the inserted view's seen region", Region.SEEN, "", 3),
+    )
+)
+
 # By a vision-language model, where one was asked: 1 to 5.
 JUDGED = (
     Metric(
@@ -785,7 +805,7 @@ JUDGED = (
         shown=Shown.TABLE,
     ),
 )
-MEASURED = (*QUALITY, *INSERTION, *GEOMETRY, *LOOKED, *JUDGED, *COUNTS)
+MEASURED = (*QUALITY, *INSERTION, *GEOMETRY, *LOOKED, *REGIONS, *JUDGED, *COUNTS)
 _known = {metric.name: metric for metric in MEASURED}
 
 

@@ -17,12 +17,13 @@ from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.earlier import EarlierRegions
 from sceneexpander.evaluation.held_out import Unseen, measure_held_out
-from sceneexpander.evaluation.measure import Measure, Navigation, Subject, Values, known_values
+from sceneexpander.evaluation.measure import Measure, Subject, Values, known_values
 from sceneexpander.evaluation.sizes import AtOtherSizes
 from sceneexpander.evaluation.tour import TourConsistency
-from sceneexpander.evaluation.truth import TruthMetrics, against_truth
+from sceneexpander.evaluation.truth import InsertedRegions, TruthMetrics, against_truth
 from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverage, measure_views, see_views
 from sceneexpander.evaluation.visual import Visual
+from sceneexpander.geometry.cameras import Cameras
 
 NOTHING_HELD_OUT = HeldOut()
 
@@ -61,6 +62,7 @@ MEASURES: list[Measure] = [
     EarlierRegions(),
     TourConsistency(),
     AgainstTruth(),
+    InsertedRegions(),
     Counts(),
 ]
 
@@ -86,7 +88,7 @@ def evaluate(
     scene: str,
     round_number: int,
     seed: int,
-    navigation: Navigation | None = None,
+    navigation: Cameras | None = None,
     truth: SceneTruth | None = None,
     held_out: HeldOut = NOTHING_HELD_OUT,
     fit: Fit = Fit.PREDICTED,

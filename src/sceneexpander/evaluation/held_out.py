@@ -34,6 +34,7 @@ from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.frontend.resection import Sighting, resect, solve_pose
 from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, SfmConfig
 from sceneexpander.frontend.twoview import homogeneous_rays
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rotation_angle_deg, transform_points
 from sceneexpander.geometry.similarity import align_poses
 from sceneexpander.splatting import render
@@ -45,7 +46,6 @@ _FOCAL_FACTORS = tuple(
     math.log(factor) for factor in (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0)
 )  # tried where no lens is known
 _FEWEST_PIXELS = 64
-Camera = tuple[Float[Tensor, "4 4"], Float[Tensor, "3 3"]]
 
 
 @torch.no_grad()
@@ -82,7 +82,7 @@ def measure_held_out(
         if camera is None:
             _log.warning("%s: the held-out photo has no camera in the scene of %s", record.name, reconstruction.method)
         else:
-            drawn = render(reconstruction.gaussians, camera[0][None], camera[1][None], views.height, views.width)
+            drawn = render(reconstruction.gaussians, camera)
             view = UnseenView(
                 picture=views.images[number],
                 photo=views.photo(number),
@@ -101,18 +101,18 @@ def measure_held_out(
 
 def pose_held_out(
     reconstruction: Reconstruction, held_out: HeldOut, number: int, seen: Sequence[SeenView]
-) -> Camera | None:
-    """``world_from_cam`` and intrinsics (stored pixels) of one held-out photo in a reconstruction's own frame; None: not to be found."""
+) -> Cameras | None:
+    """The camera (stored pixels) of one held-out photo in a reconstruction's own frame; None: not to be found."""
     assert held_out.views is not None  # noqa: S101 - by the caller
     record = held_out.views.records[number]
+    height, width = reconstruction.depth.shape[1:]
     places = {view_id: index for index, view_id in enumerate(reconstruction.view_ids)}
     lens = _lens_of(reconstruction, held_out, number, places)
     given = _given_pose(reconstruction, held_out, record.view_id, places)
     if given is not None and lens is not None:
-        return given, lens
+        return Cameras(given[None], lens[None], height, width)
     by_index = {view.index: view for view in seen}
     points, pixels = _points(reconstruction, held_out.ties_of(record.view_id), places, by_index)
-    height, width = reconstruction.depth.shape[1:]
     unit = max(height, width) / REFERENCE_LONG_SIDE_PX
     threshold, noise = _THRESHOLDS.register_px * unit, _THRESHOLDS.robust_px * unit
     if lens is not None:
@@ -142,7 +142,7 @@ def pose_held_out(
         return None
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ translation
-    return torch.from_numpy(pose).to(reconstruction.world_from_cam), lens
+    return Cameras(torch.from_numpy(pose)[None].to(reconstruction.world_from_cam), lens[None], height, width)
 
 
 def _lens_of(

@@ -32,13 +32,12 @@ from torch.nn import functional
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
-from sceneexpander.evaluation.measure import Measure, Navigation, Subject, Values
+from sceneexpander.evaluation.measure import Measure, Subject, Values
 from sceneexpander.frontend.features import detect_features, grey_u8
 from sceneexpander.frontend.sfm import estimate_cameras
 from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig
 from sceneexpander.frontend.twoview import match_descriptors
-from sceneexpander.geometry.camera import unproject_to_world
-from sceneexpander.geometry.lookup import seen_at
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.splatting import render
@@ -137,7 +136,7 @@ def _parallax_px(frames: Frames, a: int, b_from_a: Float[Tensor, "4 4"], focal_p
 
 
 @torch.no_grad()
-def see_frames(reconstruction: Reconstruction, path: Navigation, count: int) -> Frames:
+def see_frames(reconstruction: Reconstruction, path: Cameras, count: int) -> Frames:
     """Evenly spread frames of a path, those left out that stand where an earlier one does (paths return)."""
     chosen: list[int] = []
     extent = float((path.world_from_cam[:, :3, 3] - path.world_from_cam[:, :3, 3].mean(0)).norm(dim=-1).max())
@@ -145,17 +144,13 @@ def see_frames(reconstruction: Reconstruction, path: Navigation, count: int) -> 
         pose = path.world_from_cam[index]
         if not any(_same_camera(pose, path.world_from_cam[other], extent) for other in chosen):
             chosen.append(index)
-    poses, lenses = path.world_from_cam[chosen], path.intrinsics_px[chosen]
-    seen = [
-        render(reconstruction.gaussians, pose[None], lens[None], path.height, path.width)
-        for pose, lens in zip(poses, lenses, strict=True)
-    ]
+    seen = [render(reconstruction.gaussians, path[index]) for index in chosen]
     return Frames(
         rgb=torch.cat([one.rgb for one in seen]).clamp(0, 1),
         depth=torch.cat([one.depth for one in seen]),
         alpha=torch.cat([one.alpha for one in seen]),
-        world_from_cam=poses,
-        intrinsics_px=lenses,
+        world_from_cam=path.world_from_cam[chosen],
+        intrinsics_px=path.intrinsics_px[chosen],
     )
 
 
@@ -231,13 +226,12 @@ def steadiness(frames: Frames, config: EvaluateConfig) -> float:
 
 def _steady(frames: Frames, a: int, b: int, config: EvaluateConfig) -> float:
     height, width = frames.depth.shape[1:]
-    points = unproject_to_world(frames.depth[[a]], frames.intrinsics_px[[a]], frames.world_from_cam[[a]])
+    first, second = (Cameras(frames.world_from_cam[[i]], frames.intrinsics_px[[i]], height, width) for i in (a, b))
+    points = first.unproject(frames.depth[[a]]).reshape(-1, 3)
     content = torch.cat([frames.rgb[b], frames.depth[b][None], frames.alpha[b][None]])[None]
-    place = (frames.world_from_cam[[b]], frames.intrinsics_px[[b]])
-    sampled, z, inside = seen_at(points.reshape(-1, 3), content, *place, "bilinear")
-    there = sampled[0].reshape(5, height, width)
-    z = z[0].reshape(height, width)
-    both = inside[0].reshape(height, width) & ((there[3] - z).abs() < _SAME_DEPTH * z)
+    sampled, found = second.look_up(points, content)
+    there, z = sampled[0].reshape(5, height, width), found.depth[0].reshape(height, width)
+    both = found.in_frame[0].reshape(height, width) & ((there[3] - z).abs() < _SAME_DEPTH * z)
     both &= (frames.alpha[a] > config.coverage_alpha) & (there[4] > config.coverage_alpha)
     similar, textured = _local_correlation(_luma(frames.rgb[a]), _luma(there[:3]), both)
     if int(textured.sum()) < _FEWEST_WINDOWS:

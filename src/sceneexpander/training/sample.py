@@ -16,10 +16,9 @@ from torch.nn.functional import avg_pool2d, normalize
 
 from sceneexpander.errors import UserError
 from sceneexpander.files import complete_file
-from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
 from sceneexpander.geometry.rigid import rigid_inverse
-from sceneexpander.models.mini.pairs import sample_other_views
 
 _SCHEMA = "mini-sample-1"
 _HIDDEN_BEHIND = 0.05  # log depth behind another view's surface at which a point counts as hidden
@@ -105,13 +104,12 @@ class Sample:
         height, width = self.log_depth.shape[-2:]
         valid = self.valid[view]
         depth = torch.where(valid, self.log_depth[view], 0.0).exp()
-        points = unproject_to_world(depth[None], self.intrinsics_px[view, None], self.world_from_cam[view, None])
+        cameras = Cameras(self.world_from_cam, self.intrinsics_px, height, width)
+        points = cameras[view].unproject(depth[None])
         chosen = torch.tensor(list(others))
         surface = torch.where(self.valid[chosen], self.log_depth[chosen], 20.0)[:, None]
-        seen, log_z, in_frame = sample_other_views(
-            points.reshape(-1, 3), surface, rigid_inverse(self.world_from_cam[chosen]), self.intrinsics_px[chosen]
-        )
-        visible = in_frame & (log_z < seen[:, 0] + _HIDDEN_BEHIND)
+        seen, found = cameras[chosen].look_up(points.reshape(-1, 3), surface)
+        visible = found.in_frame & (found.depth.log() < seen[:, 0] + _HIDDEN_BEHIND)
         return visible.any(0).view(height, width) & valid
 
     def halved(self) -> Sample:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.models.mini.model import Mini
 from sceneexpander.models.protocol import ALL_HEADS, Head
@@ -151,7 +152,7 @@ def splat_row(model: Mini, sample: Sample) -> dict[str, float]:
     for name, candidate in (("network", model), ("base", base)):
         prediction = candidate.predict(sample.input_images, sample.priors(), heads=ALL_HEADS - {Head.POINTS})
         assert prediction.gaussians is not None  # noqa: S101 - asked for
-        drawn = render(prediction.gaussians, cameras, intrinsics, *sample.images.shape[-2:])
+        drawn = render(prediction.gaussians, Cameras(cameras, intrinsics, *sample.images.shape[-2:]))
         row |= _psnr_row(name, drawn.rgb.clamp(0, 1), sample)
     flat = sample.images.mean((-2, -1), keepdim=True).expand_as(sample.images)
     return row | _psnr_row("mean_colour", flat, sample)

@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from sceneexpander.files import complete_file
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.models.mini.config import MiniConfig
 from sceneexpander.models.mini.model import Mini
 from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Prediction
@@ -121,7 +122,7 @@ def _rendering_term(prediction: Prediction, sample: Sample, generator: torch.Gen
         poses.append(sample.world_from_cam[sample.inputs])
         intrinsics.append(sample.intrinsics_px[sample.inputs])
         truth.append(sample.images[sample.inputs])
-    rendered = render(prediction.gaussians, torch.stack(poses), torch.stack(intrinsics), height, width)
+    rendered = render(prediction.gaussians, Cameras(torch.stack(poses), torch.stack(intrinsics), height, width))
     losses = [render_loss(rendered.rgb[:1], torch.stack(truth[:1]))]
     if len(truth) > 1:
         # Only what the inputs show: nobody can know the rest.

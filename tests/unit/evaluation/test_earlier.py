@@ -12,7 +12,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.earlier import EarlierRegions
 from sceneexpander.evaluation.measure import Subject, Values
 from sceneexpander.evaluation.views import see_views
-from tests.unit.evaluation.made import made_reconstruction, own_pictures
+from tests.worlds.wall import made_reconstruction, own_pictures
 
 CONFIG = EvaluateConfig(st_lpips=False, cross_view=False)
 EYES = (0.0, 0.3, 2.2, 4.0)  # the last two were inserted, in rounds 1 and 2

@@ -16,10 +16,11 @@ from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.evaluation.held_out import pose_held_out
 from sceneexpander.evaluation.views import see_views
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import look_at, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting import render
-from tests.unit.evaluation.made import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures, record
+from tests.worlds.wall import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures, record
 
 CONFIG = EvaluateConfig(st_lpips=False, ghosting=False, consistency_frames=0)
 CAPTURED = (0.0, 0.6, 0.3)  # the last is the inserted view's place
@@ -37,7 +38,7 @@ def made() -> tuple[Reconstruction, ViewSet, HeldOut]:
     """A scene, its pictures, and a photo of it taken from `TRUE`, tied to the captured ones by points of the wall."""
     scene = made_reconstruction(CAPTURED)
     lens = scene.intrinsics_px[0]
-    picture = render(scene.gaussians, TRUE[None], lens[None], HEIGHT, WIDTH).rgb.clamp(0, 1)
+    picture = render(scene.gaussians, Cameras(TRUE[None], lens[None], HEIGHT, WIDTH)).rgb.clamp(0, 1)
     generator = torch.Generator().manual_seed(0)
     wall = torch.rand(200, 3, generator=generator) * torch.tensor([2.0, 1.4, 0]) + torch.tensor([-0.7, -0.7, DEPTH])
     there, _ = project_points(wall, lens, TRUE)
@@ -77,7 +78,7 @@ def test_a_held_out_photo_is_found_where_it_was_taken_whatever_the_methods_frame
     for own, expected in ((scene, TRUE), (moved(scene), TURN.poses(TRUE[None].double())[0].float())):
         camera = pose_held_out(own, held_out, 0, see_views(own, pictures, CONFIG))
         assert camera is not None
-        torch.testing.assert_close(camera[0], expected, atol=0.02, rtol=0)
+        torch.testing.assert_close(camera.world_from_cam[0], expected, atol=0.02, rtol=0)
         row = row_of(own, pictures, held_out)
         assert row.values["psnr_held_out_db"] > 35
         assert row.values["held_out_covered"] > 0.9
@@ -93,7 +94,7 @@ def test_its_colours_take_no_part_in_its_camera_and_all_in_its_numbers() -> None
     own, inverted = (pose_held_out(scene, one, 0, seen) for one in (held_out, other))
     assert own is not None
     assert inverted is not None
-    assert torch.equal(own[0], inverted[0])
+    assert torch.equal(own.world_from_cam, inverted.world_from_cam)
     assert row_of(scene, pictures, other).values["psnr_held_out_db"] < 15
 
 
@@ -136,21 +137,21 @@ def test_given_cameras_are_taken_where_the_method_kept_them_and_not_elsewhere() 
     )
     camera = pose_held_out(scene, dataclasses.replace(given, ties=()), 0, seen)
     assert camera is not None
-    torch.testing.assert_close(camera[0], TRUE, atol=1e-4, rtol=0)
+    torch.testing.assert_close(camera.world_from_cam[0], TRUE, atol=1e-4, rtol=0)
     turned = world.clone()
     turned[0, :3, :3] = turned[0, :3, :3] @ rotation_from_quat_wxyz(torch.tensor([0.9998, 0.02, 0, 0])).double()
     apart = dataclasses.replace(given, given_world_from_cam=turned)
     assert pose_held_out(scene, dataclasses.replace(apart, ties=()), 0, seen) is None
     found = pose_held_out(scene, apart, 0, seen)
     assert found is not None
-    torch.testing.assert_close(found[0], TRUE, atol=0.02, rtol=0)
+    torch.testing.assert_close(found.world_from_cam[0], TRUE, atol=0.02, rtol=0)
 
 
 def test_a_lens_of_its_own_is_found_with_the_pose() -> None:
     scene, pictures, held_out = made()
     camera = pose_held_out(scene, dataclasses.replace(held_out, lens_of=("",)), 0, see_views(scene, pictures, CONFIG))
     assert camera is not None
-    assert float(camera[1][0, 0]) == pytest.approx(float(scene.intrinsics_px[0, 0, 0]), rel=0.15)
+    assert float(camera.intrinsics_px[0, 0, 0]) == pytest.approx(float(scene.intrinsics_px[0, 0, 0]), rel=0.15)
 
 
 def test_photos_of_another_size_are_refused() -> None:

@@ -19,8 +19,8 @@ from sceneexpander.evaluation.measure import Measure, SeenView, Subject, Values
 from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.report import write_page
 from sceneexpander.tracking import scene_runs
-from tests.unit.evaluation.made import made_reconstruction, own_pictures
-from tests.unit.report.test_page import gathered, source  # noqa: F401 - fixtures
+from tests.worlds.reports import gathered, source  # noqa: F401 - fixtures
+from tests.worlds.wall import made_reconstruction, own_pictures
 
 BRIGHTNESS = Metric(
     name="brightness_captured",

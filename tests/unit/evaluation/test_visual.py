@@ -17,7 +17,7 @@ from sceneexpander.evaluation import visual
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.evaluation.visual import flip_map, lpips
-from tests.unit.evaluation.made import made_reconstruction, own_pictures
+from tests.worlds.wall import made_reconstruction, own_pictures
 
 SHAPES = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
 GOLDEN = 0.26431718468666077

@@ -23,8 +23,8 @@ from sceneexpander.splatting.video import write_video
 from stages import judge as judge_stage
 from stages.runner import Cell
 from tests.unit.generation.loopback import Service, serving
-from tests.unit.generation.rounds import made_views
-from tests.unit.judge.made import CONF, KEY, scored
+from tests.worlds.judged import CONF, KEY, scored
+from tests.worlds.rounds import made_views
 
 METHODS = ("captured", "backbone", "omnivggt")
 

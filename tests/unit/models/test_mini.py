@@ -12,11 +12,11 @@ from sceneexpander.errors import UserError
 from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gauge import priors_relative_to
 from sceneexpander.geometry.normals import normals_from_depth
-from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
-from sceneexpander.geometry.rigid import rigid_from_parts, rigid_inverse, rotation_from_quat_wxyz
-from sceneexpander.models.mini import Mini, MiniConfig
+from sceneexpander.geometry.rigid import rigid_inverse
+from sceneexpander.models.mini import Mini
 from sceneexpander.models.mini.inputs import working_size
 from sceneexpander.models.mini.pairs import PairGeometry, splat_log_depth
 from sceneexpander.models.mini.splats import covered_by_others
@@ -45,47 +45,7 @@ from sceneexpander.training.measure import geometry_row
 from sceneexpander.training.sample import Sample
 from sceneexpander.training.scores import scene_samples
 from sceneexpander.training.trainer import LossWeights, TrainConfig, Trainer
-
-TINY = MiniConfig(
-    work_px=64,
-    width=16,
-    attention_heads=1,
-    stem_widths=(8, 16, 16),
-    dpt_widths=(8, 8, 8, 8),
-    features=8,
-    head_width=8,
-    camera_blocks=1,
-    camera_gain=1.0,
-)
-
-
-def scene(views: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, Priors]:
-    """Random pictures and plausible priors; the first camera is the world."""
-    draw = torch.Generator().manual_seed(seed)
-    quat = torch.nn.functional.normalize(
-        torch.tensor([1.0, 0, 0, 0]) + 0.05 * torch.randn(views, 4, generator=draw), dim=-1
-    )
-    poses = rigid_from_parts(rotation_from_quat_wxyz(quat), 0.2 * torch.randn(views, 3, generator=draw))
-    poses[0] = torch.eye(4)
-    intrinsics = torch.tensor([[0.9 * width, 0, width / 2 + 1], [0, 0.9 * width, height / 2 - 1], [0, 0, 1]])
-    evidence = torch.rand(views, len(EVIDENCE_CHANNELS), height, width, generator=draw)
-    evidence[:, 0] = (evidence[:, 0] > 0.6).float()
-    coarse = 1 + 2 * torch.rand(views, 1, height // 14, width // 14, generator=draw)
-    depth = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bilinear")[:, 0]
-    priors = Priors(world_from_cam=poses, intrinsics_px=intrinsics.repeat(views, 1, 1), depth=depth, evidence=evidence)
-    return torch.rand(views, 3, height, width, generator=draw), priors
-
-
-def make_model(*, perturbed: bool = False, config: MiniConfig = TINY) -> Mini:
-    """A new model with fixed initial values; ``perturbed``: with last layers that are not zero."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        model = Mini(config)
-        if perturbed:
-            with torch.no_grad():
-                for parameter in model.parameters():
-                    parameter.add_(0.02 * torch.randn_like(parameter))
-    return model
+from tests.worlds.small_mini import TINY, make_model, scene
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +246,7 @@ def test_a_guess_gives_way_to_a_view_that_sees_the_place() -> None:
     sure = torch.full((40, 40), 2.0)
     for guess, expected in ((1.0, 1.0), (2.0, 1.0), (3.0, 0.0)):  # in front of the surface, on it, hidden behind it
         depth = torch.stack([torch.full((40, 40), guess), sure])
-        covered = covered_by_others(depth, confident, poses, intrinsics, posed, most_views=4)
+        covered = covered_by_others(depth, confident, Cameras(poses, intrinsics, 40, 40), posed, most_views=4)
         assert covered[0].unique().tolist() == [expected]
         assert covered[1].unique().tolist() == [0.0]
 
@@ -299,14 +259,14 @@ def test_cross_view_channels_tell_front_from_behind() -> None:
     posed = torch.ones(2, dtype=torch.bool)
     confident = torch.ones(2, 40, 40)
     log_depth = torch.log(torch.stack([torch.full((40, 40), 3.0), torch.full((40, 40), 2.0)]))
-    geometry = PairGeometry(log_depth, confident, poses, intrinsics, posed)
+    geometry = PairGeometry(log_depth, confident, Cameras(poses, intrinsics, 40, 40), posed)
     channels = geometry.compare(images, (0, 1), most_views=4)
     behind, in_front = channels[:, 2, 20, 20], channels[:, 3, 20, 20]
     ratio = torch.log(torch.tensor(1.5))
     torch.testing.assert_close(behind, torch.stack([ratio, torch.zeros(())]), atol=1e-5, rtol=0)
     torch.testing.assert_close(in_front, torch.stack([torch.zeros(()), ratio]), atol=1e-5, rtol=0)
     posed[1] = False
-    unposed = PairGeometry(log_depth, confident, poses, intrinsics, posed)
+    unposed = PairGeometry(log_depth, confident, Cameras(poses, intrinsics, 40, 40), posed)
     assert unposed.compare(images, (0, 1), most_views=4).abs().max() == 0
 
 
@@ -327,7 +287,7 @@ def test_what_is_measured_once_serves_every_subset(views: tuple[int, ...]) -> No
 def test_splatted_depth_keeps_the_nearest_point() -> None:
     intrinsics = torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]])
     points = torch.tensor([[0.01, 0.01, 4.0], [0.01, 0.01, 2.0], [0.0, 0.0, -1.0]])
-    found = splat_log_depth(points, rigid_inverse(torch.eye(4)), intrinsics, 10, 10)
+    found = splat_log_depth(points, Cameras(torch.eye(4)[None], intrinsics[None], 10, 10))
     assert int(found.isfinite().sum()) == 1
     assert found[5, 5].exp().item() == pytest.approx(2.0)
 

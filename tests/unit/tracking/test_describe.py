@@ -15,7 +15,7 @@ from sceneexpander.catalogue.course import COURSE
 from sceneexpander.tracking import TrackingConfig, record_runs
 from sceneexpander.tracking.describe import NOTE_TAG, experiment_links, experiment_note, run_note, saved_views
 from sceneexpander.tracking.store import NAMES, database_path, describe_experiments, last_experiment
-from tests.unit.tracking.test_store import CONFIG, client, record, runs
+from tests.worlds.runs import CONFIG, client, record, runs
 
 
 def tags(root: Path) -> dict[str, str]:

@@ -16,7 +16,7 @@ from sceneexpander.judge import ChatJudgeConfig, Judge, Shown, Work, make_judge
 from sceneexpander.services.pictures import SentPicture, encode_picture
 from tests.unit.generation.loopback import Answer, Service, said
 
-CONF = Path(__file__).parents[3] / "conf"
+CONF = Path(__file__).parents[2] / "conf"
 KEY = "sk-verysecret0123456789"
 OF_CHAT = ("take", "attempts", "max_requests", "max_cost_usd", "price_usd", "timeout_s", "extra_body", "key_variable")
 

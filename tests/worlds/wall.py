@@ -9,6 +9,7 @@ import torch
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.geometry.camera import camera_vector_from_pose, intrinsics_from_parts, unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, concatenate, sh_from_rgb
 from sceneexpander.geometry.rigid import look_at
 from sceneexpander.splatting import render
@@ -87,7 +88,7 @@ def made_reconstruction(eyes_x: tuple[float, ...] = (0.0, 0.3, 2.2), generated_l
 def own_pictures(reconstruction: Reconstruction) -> ViewSet:
     """What the reconstruction shows of itself, as its views."""
     seen = render(
-        reconstruction.gaussians, reconstruction.world_from_cam, reconstruction.intrinsics_px, HEIGHT, WIDTH
+        reconstruction.gaussians, Cameras(reconstruction.world_from_cam, reconstruction.intrinsics_px, HEIGHT, WIDTH)
     ).rgb.clamp(0, 1)
     flags = reconstruction.generated.tolist()
     return ViewSet(
