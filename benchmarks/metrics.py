@@ -78,7 +78,7 @@ def main() -> None:
     given = parser.parse_args()
     height, width = round(given.side * 0.75 / 14) * 14, given.side
     scene, views = made_scene(given.views, height, width)
-    config = EvaluateConfig()
+    config = EvaluateConfig(consistency_frames=8)
     poses, lenses = navigation(scene.world_from_cam, scene.intrinsics_px, given.frames, range(given.views))
     path = Cameras(poses, lenses, height, width)
     total = started = time.process_time()

@@ -27,7 +27,7 @@ class EvaluateConfig:
     coverage_alpha: OpenShare = 0.5
     cross_view: bool = True
     ghosting: bool = True
-    consistency_frames: Annotated[int, Range(0, 64)] = 8
+    consistency_frames: Annotated[int, Range(0, 64)] = 0
     hold_out: Annotated[int, Range(0, 1000)] | Literal["auto"] = "auto"
     flip: bool = True
     lpips_weights: str | None = None

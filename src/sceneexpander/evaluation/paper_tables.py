@@ -8,8 +8,9 @@ so; what some lack counts as missing for them.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from sceneexpander.catalogue.metrics import ARROWS, DASH, Better
 from sceneexpander.catalogue.paper import QUOTED, QuotedRow
@@ -18,7 +19,7 @@ from sceneexpander.catalogue.table import Table
 NOT_MEASURED = "not measured"
 NO_COMMON_CASE = "no common case"
 HERE = "here"
-Values = Mapping[str, Mapping[Hashable, float]]  # by line, by case
+Values = Mapping[str, Mapping[Any, float]]  # by line, by case (of any kind that can be a key)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +41,7 @@ class Column:
     values: Values = field(default_factory=dict)
 
     @property
-    def cases(self) -> frozenset[Hashable]:
+    def cases(self) -> frozenset[Any]:
         """Those that all measured lines have."""
         of_lines = [set(values) for values in self.values.values() if values]
         return frozenset(set.intersection(*of_lines)) if of_lines else frozenset()

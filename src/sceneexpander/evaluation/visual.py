@@ -15,13 +15,14 @@ from __future__ import annotations
 import functools
 import importlib.util
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from sceneexpander.catalogue.metrics import metrics_named
@@ -32,49 +33,52 @@ from sceneexpander.evaluation.measure import Measure, SeenView, UnseenView, Valu
 LEAST_SIDE_PX = 35  # smaller pictures vanish inside AlexNet
 _PPD = 67.0
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-_CONVOLUTIONS = (0, 3, 6, 8, 10)  # their places in torchvision's ``features``
-_POOLED = (0, 3)  # after the rectifiers of these
+# Of AlexNet's convolutions: place in torchvision's ``features``, shape, stride, padding, and whether a pooling follows.
+_LAYERS = (
+    (0, (64, 3, 11, 11), 4, 2, True),
+    (3, (192, 64, 5, 5), 1, 2, True),
+    (6, (384, 192, 3, 3), 1, 1, False),
+    (8, (256, 384, 3, 3), 1, 1, False),
+    (10, (256, 256, 3, 3), 1, 1, False),
+)
 _HEADS = "weights/v0.1/alex.pth"
 _EPS = 1e-10
 _WHERE = "evaluate.lpips_weights"
 
 
-class Lpips(nn.Module):
-    """The network: AlexNet's convolutions and the heads over them."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Network:
+    """Weights and biases of AlexNet's convolutions, and the heads over them."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.convolutions = nn.ModuleList(
-            [
-                nn.Conv2d(3, 64, 11, stride=4, padding=2),
-                nn.Conv2d(64, 192, 5, padding=2),
-                nn.Conv2d(192, 384, 3, padding=1),
-                nn.Conv2d(384, 256, 3, padding=1),
-                nn.Conv2d(256, 256, 3, padding=1),
-            ]
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+    heads: tuple[Tensor, ...]
+
+    @classmethod
+    def of(cls, backbone: Mapping[str, Tensor], heads: Mapping[str, Tensor]) -> _Network:
+        """From torchvision's weights and the package's heads. Raises `KeyError` or `ValueError` if they are others."""
+        weights = tuple(backbone[f"features.{place}.weight"].float() for place, *_ in _LAYERS)
+        for weight, (place, shape, *_) in zip(weights, _LAYERS, strict=True):
+            if tuple(weight.shape) != shape:
+                raise ValueError(f"features.{place}.weight is {tuple(weight.shape)}, not {shape}")
+        return cls(
+            weights=weights,
+            biases=tuple(backbone[f"features.{place}.bias"].float() for place, *_ in _LAYERS),
+            heads=tuple(heads[f"lin{number}.model.1.weight"].float().flatten() for number in range(len(_LAYERS))),
         )
-        self.heads = nn.ParameterList([nn.Parameter(torch.zeros(own.out_channels)) for own in self.convolutions])
-        self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None])
-        self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None])
 
-    def load(self, backbone: Mapping[str, Tensor], heads: Mapping[str, Tensor]) -> None:
-        """Take torchvision's weights and the package's heads. Raises `KeyError` or `RuntimeError` if they are others."""
-        with torch.no_grad():
-            for number, (own, place) in enumerate(zip(self.convolutions, _CONVOLUTIONS, strict=True)):
-                own.weight.copy_(backbone[f"features.{place}.weight"])
-                own.bias.copy_(backbone[f"features.{place}.bias"])
-                self.heads[number].copy_(heads[f"lin{number}.model.1.weight"].flatten())
-
-    def forward(self, images: Float[Tensor, "2 3 height width"]) -> Float[Tensor, ""]:
-        """Distance of two pictures in [0, 1]."""
-        features = (2 * images - 1 - self.shift) / self.scale
-        total = images.new_zeros(())
-        for number, (own, place) in enumerate(zip(self.convolutions, _CONVOLUTIONS, strict=True)):
-            features = functional.relu(own(features))
+    def distance(self, pair: Float[Tensor, "2 3 height width"]) -> Float[Tensor, ""]:
+        """Of two pictures in [0, 1]."""
+        shift, scale = (pair.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
+        features = (2 * pair - 1 - shift) / scale
+        total = pair.new_zeros(())
+        for number, (_, _, stride, padding, pooled) in enumerate(_LAYERS):
+            features = functional.relu(
+                functional.conv2d(features, self.weights[number], self.biases[number], stride, padding)
+            )
             unit = features / (features.square().sum(1, keepdim=True).sqrt() + _EPS)
-            squares = (unit[0] - unit[1]).square().mean(dim=(1, 2))
-            total = total + (squares * self.heads[number]).sum()
-            if place in _POOLED:
+            total = total + ((unit[0] - unit[1]).square().mean(dim=(1, 2)) * self.heads[number]).sum()
+            if pooled:
                 features = functional.max_pool2d(features, 3, 2)
         return total
 
@@ -90,11 +94,11 @@ def lpips(
         ValueError: shapes differ, or values are not finite.
     """
     pair = _pair(image, reference)
-    return float(_network(weights)(pair)) if min(pair.shape[2:]) >= LEAST_SIDE_PX else None
+    return float(_network(weights).distance(pair)) if min(pair.shape[2:]) >= LEAST_SIDE_PX else None
 
 
 @functools.cache
-def _network(weights: Path) -> Lpips:
+def _network(weights: Path) -> _Network:
     package = importlib.util.find_spec("lpips")
     if package is None or package.origin is None:
         raise UserError(
@@ -102,9 +106,8 @@ def _network(weights: Path) -> Lpips:
             where=_WHERE,
             fix="pip install lpips==0.1.4 --no-deps",
         )
-    network = Lpips().eval()
     try:
-        network.load(_tensors(weights), _tensors(Path(package.origin).parent / _HEADS))
+        return _Network.of(_tensors(weights), _tensors(Path(package.origin).parent / _HEADS))
     except (KeyError, RuntimeError, AttributeError, ValueError, OSError, EOFError, UnpicklingError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(
@@ -112,7 +115,6 @@ def _network(weights: Path) -> Lpips:
             where=_WHERE,
             fix="give torchvision's alexnet-owt-7be5be79.pth",
         ) from None
-    return network
 
 
 def _tensors(path: Path) -> dict[str, Tensor]:

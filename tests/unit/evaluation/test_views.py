@@ -153,16 +153,16 @@ def test_sizes_must_agree() -> None:
 
 def test_row_holds_everything_and_survives_the_disk(tmp_path: Path) -> None:
     scene = made_reconstruction()
-    row = evaluate(scene, own_pictures(scene), CONFIG, scene="made", round_number=1, seed=0, navigation=scene.cameras)
+    full = dataclasses.replace(CONFIG, consistency_frames=3)
+    row = evaluate(scene, own_pictures(scene), full, scene="made", round_number=1, seed=0, navigation=scene.cameras)
     assert [row.value(name) for name in ("views_captured", "views_generated", "tour_frames")] == [2, 1, 3]
     assert row.value("gaussians") == 3 * HEIGHT * WIDTH
     assert row.value("gaussians_generated") == HEIGHT * WIDTH
     assert row.value("psnr_inserted_db") == PSNR_CAP_DB
     assert row.value("depth_abs_rel") is None
     assert row.value("tour_registered") is not None
-    unmeasured = dataclasses.replace(CONFIG, consistency_frames=0)
     without = evaluate(
-        scene, own_pictures(scene), unmeasured, scene="made", round_number=1, seed=0, navigation=navigation
+        scene, own_pictures(scene), CONFIG, scene="made", round_number=1, seed=0, navigation=scene.cameras
     )
     assert without.value("tour_registered") is None
     assert row.numbers()["psnr_captured_db"] == PSNR_CAP_DB

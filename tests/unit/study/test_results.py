@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -228,15 +229,12 @@ def test_tau_between_people_and_measures_by_hand() -> None:
 def test_the_pipelines_headline_numbers_and_its_judge_are_measures(tmp_path: Path) -> None:
     path = tmp_path / "metrics.json"
     scores = {"a": 5.0, "b": 3.0, "c": 1.0}
-    numbers = {
-        scene: {
-            "round_1": {
-                **{name: {"psnr_captured_db": -score, "judge_insertion": score} for name, score in scores.items()},
-                "omnivggt": {"unavailable": "needs its checkpoint"},
-            }
+    numbers: dict[str, Any] = {}
+    for scene in ("one", "two"):
+        methods: dict[str, Any] = {
+            name: {"psnr_captured_db": -score, "judge_insertion": score} for name, score in scores.items()
         }
-        for scene in ("one", "two")
-    }
+        numbers[scene] = {"round_1": methods | {"omnivggt": {"unavailable": "needs its checkpoint"}}}
     path.write_text(json.dumps(numbers))
     ranked = ranked_by([[1, 2, 3], [1, 2, 3]], [[1, 2, 3], [1, 2, 3]])
     found = {
