@@ -25,7 +25,7 @@ class Sections:
 
 @stage("scene", "round", "previous", "method")
 def main(cell: Cell) -> None:
-    """Measure on the views of all rounds so far, on the tour, and against known truth where the scene has it."""
+    """Measure on the views of all rounds so far, on held-out photos, on the tour, and against known truth where the scene has it."""
     sections = read_sections(layout.config(cell.scene), Sections)
     made = layout.reconstruction(cell.scene, cell.round, cell.method)
     lacking = unavailable_in(made)
@@ -40,6 +40,7 @@ def main(cell: Cell) -> None:
         ).save(layout.metrics(cell.scene, cell.round, cell.method))
         return
     # Only now: torch takes seconds to import.
+    from sceneexpander.artifacts.held_out import HeldOut
     from sceneexpander.artifacts.inserted import InsertedView
     from sceneexpander.artifacts.reconstruction import Reconstruction
     from sceneexpander.artifacts.renders import Renders
@@ -53,6 +54,7 @@ def main(cell: Cell) -> None:
     before = ViewSet.load(layout.state(cell.scene, cell.previous) / "views")
     views = before.append(InsertedView.load(layout.inserted(cell.scene, cell.round)).view)
     renders = Renders.load(layout.renders(cell.scene, cell.round, cell.method))
+    held_out = HeldOut.load(layout.matched_held_out(cell.scene))
     truth = SceneTruth.load(layout.truth(cell.scene))
     runs = [made, *sorted(made.parent.glob(layout.REPEATS))]
     rows = [
@@ -65,6 +67,7 @@ def main(cell: Cell) -> None:
             seed=sections.seed,
             navigation=renders.cameras,
             truth=truth if truth.views else None,
+            held_out=held_out,
             fit=fit_of(cell),
         )
         for run in runs

@@ -38,8 +38,8 @@ def selection(scene: str) -> Path:
 def given(scene: str, kind: str) -> Path:
     """A folder of links to files that the configuration names, wherever they are: the pipeline depends on their bytes.
 
-    ``kind``: ``generator`` and ``choice`` (a folder per round), ``judge`` (a prompt per criterion), ``model`` (weights), or a rival's name
-    (weights).
+    ``kind``: ``generator`` and ``choice`` (a folder per round), ``judge`` (a prompt per criterion), ``lpips`` and ``model`` (weights), or a
+    rival's name (weights).
     """
     return GIVEN / scene / kind
 
@@ -67,6 +67,16 @@ def round_key(number: int) -> str:
 def proposals(scene: str, number: int) -> Path:
     """The `Proposals` after a round."""
     return round_folder(scene, number) / "proposals"
+
+
+def held_out(scene: str) -> Path:
+    """The `HeldOut` photos as prepared: of the stages, only the one that matches them reads it."""
+    return OUTPUTS / scene / "held_out"
+
+
+def matched_held_out(scene: str) -> Path:
+    """The `HeldOut` photos with what ties them to the captured ones."""
+    return OUTPUTS / scene / "matched_held_out"
 
 
 def truth(scene: str) -> Path:

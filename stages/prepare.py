@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.config.files import read_sections
+from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.files import directory_being_written
-from sceneexpander.ingest import IngestConfig, load_scene, recorded_files
+from sceneexpander.ingest import IngestConfig, hold_out, load_scene, recorded_files
 from sceneexpander.ingest.truth import load_truth
 from stages import layout
 from stages.runner import Cell, stage
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,14 +23,17 @@ class Sections:
     """What this stage reads of the configuration."""
 
     scene: IngestConfig
+    evaluate: EvaluateConfig  # only how many photos it holds out
 
 
 @stage("scene")
 def main(cell: Cell) -> None:
-    """Read, check and fit the photos; keep rounds apart, so that one more changes none of the others."""
+    """Read, check and fit the photos, hold some out; keep rounds apart, so that one more changes none of the others."""
     sections = read_sections(layout.config(cell.scene), Sections)
     source = layout.source(cell.scene)
-    scene = load_scene(source, sections.scene)
+    scene, held_out = hold_out(load_scene(source, sections.scene), sections.evaluate.hold_out)
+    if held_out.views is not None:
+        _log.info("%s", scene.notes[-1])
     with directory_being_written(layout.prepared(cell.scene)) as folder:
         scene.save(folder)
     with directory_being_written(layout.asked(cell.scene, 1).parent) as folder:
@@ -37,6 +44,8 @@ def main(cell: Cell) -> None:
                 copy = place / layout.RECORDED / path.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, copy)
+    with directory_being_written(layout.held_out(cell.scene)) as folder:
+        held_out.save(folder)
     with directory_being_written(layout.truth(cell.scene)) as folder:
         (load_truth(source) or SceneTruth()).save(folder)
 

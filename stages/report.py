@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sceneexpander.artifacts.judgement import SCENE_CRITERIA, JudgedRound
+from sceneexpander.artifacts.judgement import JudgedRound
 from sceneexpander.artifacts.metrics import MetricsRow, Row, load_row
 from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.errors import UserError
+from sceneexpander.evaluation.judged import with_judged
 from sceneexpander.evaluation.table import comparison_table, scene_table
 from sceneexpander.files import directory_being_written, write_bytes_atomic
 from sceneexpander.pipeline.selection import read_selection
@@ -24,16 +25,6 @@ def _digits(value: float) -> float:
     return float(f"{value:.5g}")
 
 
-def _judged_numbers(judged: JudgedRound, method: str) -> dict[str, float]:
-    """Means by criterion, of those that have one: a score that is missing is no number."""
-    scores = {criterion: judged.score(method, criterion) for criterion in SCENE_CRITERIA}
-    return {
-        f"judge_{criterion}": _digits(score.mean)
-        for criterion, score in scores.items()
-        if score is not None and score.mean is not None
-    }
-
-
 @stage()
 def main(_: Cell) -> None:
     """Page, tables, numbers; scenes, rounds and methods as params.yaml lists them."""
@@ -46,13 +37,13 @@ def main(_: Cell) -> None:
             judged.append(JudgedRound.load(layout.PAGES / scene / f"round_{number}"))
             for method in selected.methods:
                 row = load_row(layout.PAGES / scene / f"round_{number}" / method / "metrics.json")
+                row = with_judged(row, judged[-1]) if isinstance(row, MetricsRow) else row
                 rows.append(row)
                 known: dict[str, float | str] = (
                     {name: _digits(value) for name, value in row.numbers().items()}
                     if isinstance(row, MetricsRow)
                     else {"unavailable": row.reason}
                 )
-                known |= _judged_numbers(judged[-1], method)
                 numbers.setdefault(scene, {}).setdefault(f"round_{number}", {})[method] = known
     if not rows:
         raise UserError("selects nothing to report", where="params.yaml", fix="name scenes, rounds and methods")

@@ -45,6 +45,7 @@ def named_files(values: Mapping[str, Any], rounds: Sequence[Mapping[str, Any]]) 
     judge = decode_dataclass(JudgeConfig, values["judge"])
     found: dict[str, dict[str, Path | None]] = {
         "judge": dict(judge.named_files()),
+        "lpips": {"weights": named_file(values["evaluate"]["lpips_weights"])},
         "model": {"weights": named_file(values["model"]["weights"])},
     }
     for number, sections in enumerate(rounds, start=1):

@@ -30,7 +30,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
     project = Project(tmp_path_factory.mktemp("pipeline") / "project")
     executed = project.repro()
     assert executed[0] == "code"
-    assert len(executed) == 33, executed
+    assert len(executed) == 34, executed
     yield project
     shutil.rmtree(project.folder, ignore_errors=True)
 

@@ -75,13 +75,13 @@ class Tiny:
         self.write(
             layout.config(SCENE),
             dict.fromkeys(SECTIONS, 1)
-            | {"evaluate": 1, "judge": 1, "rivals": dict.fromkeys(methods_of(Kind.RIVAL), 1)},
+            | {"evaluate": {"hold_out": 1}, "judge": 1, "rivals": dict.fromkeys(methods_of(Kind.RIVAL), 1)},
         )
         self.write(layout.round_settings(SCENE), {layout.round_key(1): dict.fromkeys(ROUND_SECTIONS, 1)})
         self.write(layout.asked(SCENE, 1) / "facts.json", {})
         self.write(layout.selection(SCENE), {method.name: True for method in METHODS if not method.always_made})
         self.write(layout.CODE, hashes(TREE, HERE))
-        for kind in ("judge", "model", *methods_of(Kind.RIVAL)):
+        for kind in ("judge", "lpips", "model", *methods_of(Kind.RIVAL)):
             link_files({}, folder / layout.given(SCENE, kind))
         link_files({"file": folder / "away/picture.png"}, folder / layout.given(SCENE, "generator") / "round_1")
         link_files({"file": folder / "away/chosen.png"}, folder / layout.given(SCENE, "choice") / "round_1")

@@ -36,7 +36,7 @@ ROOMS: dict[str, set[str]] = {
     "reconstruction": {"artifacts", "frontend", "geometry", "inference", "models", "photometric"},
     "insertion": {"artifacts", "geometry", "models", "photometric", "reconstruction", "splatting"},
     "expansion": {"adaptation", "artifacts", "insertion", "photometric", "reconstruction"},
-    "evaluation": {"artifacts", "catalogue", "geometry", "splatting"},
+    "evaluation": {"artifacts", "catalogue", "frontend", "geometry", "splatting"},
     "expandbench": {
         "adaptation",
         "artifacts",

@@ -54,7 +54,8 @@ class MetricsRow:
     Numbers of captured views are means over those with a pose, numbers of the inserted view are of the one inserted in this round.
     A view without a pose stands at a placeholder and shows little but its own Gaussians: it is in ``views`` and in no mean. Where no
     captured view has a pose (``views_captured_posed`` is 0), the means are over all of them. Unless ``fit`` says as predicted, the
-    numbers at the method's own cameras are those of pictures that its Gaussians were fitted to.
+    numbers at the method's own cameras are those of pictures that its Gaussians were fitted to; ``held_out`` are photos that nothing was
+    made from, and numbers of them are means over all of these, or absent where one has no camera in the method's scene.
     """
 
     scene: str
@@ -68,6 +69,7 @@ class MetricsRow:
     repeats: int = 1
     spread: Mapping[str, float] = field(default_factory=dict)
     views: tuple[ViewMetrics, ...] = ()
+    held_out: tuple[ViewMetrics, ...] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -53,7 +53,7 @@ class Views(StrEnum):
     CAPTURED = "captured"  # the mean over those that have a camera
     INSERTED = "inserted"  # the one of the row's round
     EARLIER = "earlier"  # captured and inserted ones that are older than the row's round
-    HELD_OUT = "held_out"  # at true cameras that no method was given
+    HELD_OUT = "held_out"  # that no method was given
     TOUR = "tour"  # the frames of the camera path
     NONE = "none"  # the reconstruction or the run as a whole
 
@@ -74,6 +74,7 @@ class Region(StrEnum):
     ALL = "all"
     OTHERS = "others"  # what Gaussians of other views cover
     NEW = "new"  # what no captured view sees
+    SEEN = "seen"  # what a captured view sees
     GAINED = "gained"  # what the insertion added to what was covered before it
 
 
@@ -201,7 +202,8 @@ def _at_size(
 _CAPTURED = Scope(views=Views.CAPTURED)
 _INSERTED = Scope(views=Views.INSERTED)
 _EARLIER = Scope(views=Views.EARLIER)
-_HELD_OUT = Scope(views=Views.HELD_OUT, region=Region.NEW)
+_HELD_OUT = Scope(views=Views.HELD_OUT)
+_NEW_HELD_OUT = Scope(views=Views.HELD_OUT, region=Region.NEW)
 _WHOLE = Scope(views=Views.NONE)
 _TOUR = Scope(views=Views.TOUR)
 
@@ -270,6 +272,52 @@ QUALITY = (
         ("", "", "", "The share that one looks through when the pictures are drawn at four times the stored size."),
     ),
     Metric(
+        name="psnr_held_out_db",
+        group=Group.QUALITY,
+        title="PSNR of held-out photos",
+        scope=_HELD_OUT,
+        unit="dB",
+        better="higher",
+        meaning="Photos that nothing was made from, each at the camera found for it afterwards; all other PSNRs of photos are of "
+        "pictures that the method was given.",
+        shown=Shown.PAGE,
+    ),
+    Metric(
+        name="ssim_held_out",
+        group=Group.QUALITY,
+        title="SSIM of held-out photos",
+        scope=_HELD_OUT,
+        digits=3,
+        better="higher",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="st_lpips_held_out",
+        group=Group.QUALITY,
+        title="ST-LPIPS of held-out photos",
+        scope=_HELD_OUT,
+        digits=4,
+        better="lower",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="psnr_held_out_covered_db",
+        group=Group.QUALITY,
+        title="PSNR of held-out photos where covered",
+        scope=_HELD_OUT,
+        unit="dB",
+        better="higher",
+    ),
+    Metric(
+        name="held_out_covered",
+        group=Group.QUALITY,
+        title="Held-out photos covered",
+        scope=_HELD_OUT,
+        unit="%",
+        digits=1,
+        better="higher",
+    ),
+    Metric(
         name="psnr_from_others_db",
         group=Group.QUALITY,
         title="PSNR from others",
@@ -306,6 +354,25 @@ QUALITY = (
         better="higher",
     ),
     Metric(
+        name="structure_ghosted",
+        group=Group.QUALITY,
+        title="Ghosting",
+        scope=Scope(views=Views.CAPTURED, region=Region.OTHERS),
+        unit="%",
+        digits=1,
+        better="lower",
+        meaning="Share of the photos' structure that the other views' Gaussians do not paint in its place.",
+        shown=Shown.PAGE,
+    ),
+    Metric(
+        name="structure_offset",
+        group=Group.QUALITY,
+        title="Ghosting offset, of the long side",
+        scope=Scope(views=Views.CAPTURED, region=Region.OTHERS),
+        unit="%",
+        better="lower",
+    ),
+    Metric(
         name="tour_covered",
         group=Group.QUALITY,
         title="Tour covered",
@@ -326,6 +393,75 @@ QUALITY = (
         better="higher",
         meaning="The same less what the scene before the insertion covers.",
         shown=Shown.TABLE,
+    ),
+    Metric(
+        name="tour_registered",
+        group=Group.QUALITY,
+        title="Tour registered",
+        scope=_TOUR,
+        unit="%",
+        digits=1,
+        better="higher",
+        meaning="Share of the tour's frames that structure from motion finds a camera for, from the frames alone.",
+        shown=Shown.PAGE,
+    ),
+    Metric(
+        name="tour_camera_auc",
+        group=Group.QUALITY,
+        title="Tour cameras, AUC@10\u00b0",
+        scope=_TOUR,
+        unit="%",
+        digits=1,
+        better="higher",
+        meaning="How near the cameras found from the frames are to those of the tour.",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="tour_tsed",
+        group=Group.QUALITY,
+        title="Tour TSED",
+        scope=_TOUR,
+        unit="%",
+        digits=1,
+        better="higher",
+        meaning="Share of consecutive frames whose matches lie on the epipolar lines of the tour's cameras and move with depth.",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="tour_steadiness",
+        group=Group.QUALITY,
+        title="Tour steadiness",
+        scope=_TOUR,
+        digits=3,
+        better="higher",
+        meaning="Local correlation of consecutive frames, warped by depth.",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="tour_observations",
+        group=Group.QUALITY,
+        title="Triangulated observations per frame of the tour",
+        scope=_TOUR,
+        digits=0,
+        better="higher",
+    ),
+    Metric(
+        name="tour_rotation_deg",
+        group=Group.QUALITY,
+        title="Rotation of the tour's registered cameras",
+        scope=_TOUR,
+        unit="deg",
+        digits=1,
+        better="lower",
+    ),
+    Metric(
+        name="tour_direction_deg",
+        group=Group.QUALITY,
+        title="Direction of the tour's registered cameras",
+        scope=_TOUR,
+        unit="deg",
+        digits=1,
+        better="lower",
     ),
     Metric(
         name="views_covered",
@@ -407,6 +543,25 @@ INSERTION = (
         digits=1,
     ),
     Metric(
+        name="inserted_structure_ghosted",
+        group=Group.INSERTION,
+        title="Inserted ghosting",
+        scope=Scope(views=Views.INSERTED, region=Region.OTHERS),
+        unit="%",
+        digits=1,
+        better="lower",
+        meaning="The same of the inserted picture, where the captured views overlap with it.",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="inserted_structure_offset",
+        group=Group.INSERTION,
+        title="Inserted ghosting offset, of the long side",
+        scope=Scope(views=Views.INSERTED, region=Region.OTHERS),
+        unit="%",
+        better="lower",
+    ),
+    Metric(
         name="inserted_covered",
         group=Group.INSERTION,
         title="Inserted view covered",
@@ -426,7 +581,7 @@ INSERTION = (
         name="psnr_new_region_db",
         group=Group.INSERTION,
         title="New-region PSNR",
-        scope=_HELD_OUT,
+        scope=_NEW_HELD_OUT,
         unit="dB",
         better="higher",
         meaning="What no captured view sees, at the true intended camera, against the consistent picture; black where nothing is drawn.",
@@ -436,7 +591,7 @@ INSERTION = (
         name="new_region_drawn",
         group=Group.INSERTION,
         title="New region drawn",
-        scope=_HELD_OUT,
+        scope=_NEW_HELD_OUT,
         unit="%",
         digits=1,
         better="higher",
@@ -447,7 +602,7 @@ INSERTION = (
         name="new_region_drawn_abs_rel",
         group=Group.INSERTION,
         title="New region's drawn depth error",
-        scope=_HELD_OUT,
+        scope=_NEW_HELD_OUT,
         unit="%",
         digits=1,
         better="lower",
@@ -580,13 +735,77 @@ COUNTS = (
     _count("views_captured", "Captured views"),
     _count("views_captured_posed", "Captured views with a pose"),
     _count("views_generated", "Generated views"),
+    _count("views_held_out", "Held-out photos", _HELD_OUT),
+    _count("views_held_out_posed", "Held-out photos with a pose", _HELD_OUT),
     _count("gaussians", "Gaussians"),
     _count("gaussians_generated", "Gaussians from generated views"),
     _count("tour_frames", "Frames of the tour", _TOUR),
     _count("repeats", "Runs with other seeds"),
 )
 
-MEASURED = (*QUALITY, *INSERTION, *GEOMETRY, *COUNTS)
+
+def _looked(kind: str, title: str, digits: int) -> tuple[Metric, ...]:
+    """LPIPS or FLIP of each kind of views."""
+    places = (
+        ("captured", Group.QUALITY, _CAPTURED, "stored size", Shown.TABLE),
+        ("held_out", Group.QUALITY, _HELD_OUT, "held-out photos", Shown.TABLE),
+        ("inserted", Group.INSERTION, _INSERTED, "inserted view", Shown.TRACKED),
+    )
+    return tuple(
+        Metric(
+            name=f"{kind}_{name}",
+            group=group,
+            title=f"{title}, {where}",
+            scope=scope,
+            digits=digits,
+            better="lower",
+            shown=shown,
+        )
+        for name, group, scope, where, shown in places
+    )
+
+
+LOOKED = (*_looked("lpips", "LPIPS", 3), *_looked("flip", "FLIP", 3))
+
+# Where the new region is known.
+REGIONS = tuple(
+    Metric(
+        name=name,
+        group=Group.INSERTION,
+        title=title,
+        scope=Scope(views=Views.INSERTED, region=region),
+        unit=unit,
+        digits=digits,
+        better="higher",
+    )
+    for name, title, region, unit, digits in (
+        ("psnr_inserted_new_db", "PSNR of the inserted view's new region", Region.NEW, "dB", 2),
+        ("ssim_inserted_new", "SSIM of the inserted view's new region", Region.NEW, "", 3),
+        ("psnr_inserted_seen_db", "PSNR of the inserted view's seen region", Region.SEEN, "dB", 2),
+        ("ssim_inserted_seen", "SSIM of the inserted view's seen region", Region.SEEN, "", 3),
+    )
+)
+
+# By a vision-language model, where one was asked: 1 to 5.
+JUDGED = (
+    Metric(
+        name="judge_insertion",
+        group=Group.INSERTION,
+        title="Judge: insertion satisfaction",
+        scope=_TOUR,
+        better="higher",
+        shown=Shown.TABLE,
+    ),
+    Metric(
+        name="judge_quality",
+        group=Group.QUALITY,
+        title="Judge: render quality",
+        scope=_TOUR,
+        better="higher",
+        shown=Shown.TABLE,
+    ),
+)
+MEASURED = (*QUALITY, *INSERTION, *GEOMETRY, *LOOKED, *REGIONS, *JUDGED, *COUNTS)
 _known = {metric.name: metric for metric in MEASURED}
 
 

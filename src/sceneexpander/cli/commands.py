@@ -32,6 +32,7 @@ COMMANDS = (
     ),
     Command("plan", "sceneexpander.plan", "tell memory and operations in advance, without a GPU or weights"),
     Command("judge", "sceneexpander.judge_run", "have a vision-language model judge finished scenes"),
+    Command("table", "sceneexpander.tables", "fill the paper's two tables with what was measured here"),
     Command("view", "sceneexpander.viewer.__main__", "walk through a reconstructed scene in the browser"),
     Command(
         "study", "sceneexpander.study.__main__", "let people rank videos of methods blindly, and compute what they said"

@@ -24,6 +24,7 @@ from sceneexpander.typed import members_of
 PATH_KEYS = frozenset(
     {
         "model.weights",
+        "evaluate.lpips_weights",
         "generator.file",
         "generator.workflow",
         "choose.candidate",

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import torch
-
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.measure import Measure, Subject, Values
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
-from sceneexpander.evaluation.views import see_view
 
 
 class EarlierRegions(Measure):
@@ -19,21 +16,18 @@ class EarlierRegions(Measure):
 
     metrics = metrics_named("psnr_earlier_inserted_db", "psnr_worst_earlier_db")
 
-    @torch.no_grad()
     def of_scene(self, subject: Subject) -> Values:
         """Nothing inserted earlier in a first round."""
-        made, records = subject.reconstruction, subject.views.records
-        place_of = {record.view_id: place for place, record in enumerate(records)}
+        made = subject.reconstruction
+        round_of = {record.view_id: record.round for record in subject.views.records}
         captured: list[float] = []
         inserted: list[float] = []
-        for index, view_id in enumerate(made.view_ids):
-            place = place_of[view_id]
-            generated = bool(made.generated[index])
-            if not bool(made.posed[index]) or (generated and records[place].round >= subject.round_number):
+        for view in subject.seen:
+            later = round_of[made.view_ids[view.index]] >= subject.round_number
+            if not bool(made.posed[view.index]) or (view.generated and later):
                 continue
-            view = see_view(made, index, subject.views, place, subject.config)
             value = min(psnr(view.render.rgb[0], view.picture, view.valid), PSNR_CAP_DB)
-            (inserted if generated else captured).append(value)
+            (inserted if view.generated else captured).append(value)
         return {
             "psnr_earlier_inserted_db": sum(inserted) / len(inserted) if inserted else None,
             "psnr_worst_earlier_db": min((*captured, *inserted), default=None),

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 
+from sceneexpander.artifacts.held_out import HeldOut
 from sceneexpander.artifacts.metrics import Fit, MetricsRow, ViewMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.truth import SceneTruth
@@ -15,11 +16,16 @@ from sceneexpander.catalogue import register
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.earlier import EarlierRegions
+from sceneexpander.evaluation.held_out import Unseen, measure_held_out
 from sceneexpander.evaluation.measure import Measure, Subject, Values, known_values
 from sceneexpander.evaluation.sizes import AtOtherSizes
-from sceneexpander.evaluation.truth import TruthMetrics, against_truth
-from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverage, measure_views
+from sceneexpander.evaluation.tour import TourConsistency
+from sceneexpander.evaluation.truth import InsertedRegions, TruthMetrics, against_truth
+from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverage, measure_views, see_views
+from sceneexpander.evaluation.visual import Visual
 from sceneexpander.geometry.cameras import Cameras
+
+NOTHING_HELD_OUT = HeldOut()
 
 
 class Counts(Measure):
@@ -48,11 +54,15 @@ class AgainstTruth(Measure):
 
 MEASURES: list[Measure] = [
     AtStoredSize(),
+    Unseen(),
+    Visual(),
     FromOthers(),
     AtOtherSizes(),
     TourCoverage(),
     EarlierRegions(),
+    TourConsistency(),
     AgainstTruth(),
+    InsertedRegions(),
     Counts(),
 ]
 
@@ -80,6 +90,7 @@ def evaluate(
     seed: int,
     navigation: Cameras | None = None,
     truth: SceneTruth | None = None,
+    held_out: HeldOut = NOTHING_HELD_OUT,
     fit: Fit = Fit.PREDICTED,
 ) -> MetricsRow:
     """Measure a reconstruction.
@@ -93,10 +104,13 @@ def evaluate(
         seed: for the row.
         navigation: frames for the coverage, if wanted.
         truth: known truth, if any.
+        held_out: photos that the reconstruction was not made from, matched with the captured ones.
         fit: what was done to its Gaussians after they were predicted.
     """
-    captured = measure_views(reconstruction, views, config, MEASURES, generated=False)
-    inserted = measure_views(reconstruction, views, config, MEASURES, generated=True)
+    seen = see_views(reconstruction, views, config)
+    captured = measure_views(seen, MEASURES, generated=False)
+    inserted = measure_views(seen, MEASURES, generated=True)
+    unseen = measure_held_out(reconstruction, held_out, seen, config, MEASURES)
     if not captured:
         raise ValueError("the reconstruction has no captured view")
     in_this_round = {record.view_id for record in views.records if record.round == round_number}
@@ -107,6 +121,7 @@ def evaluate(
         views=views,
         round_number=round_number,
         config=config,
+        seen=seen,
         navigation=navigation,
         truth=truth,
     )
@@ -116,6 +131,7 @@ def evaluate(
         "views_generated": float(len(inserted)),
         **_means(posed or captured),
         **({} if new is None else new.values),
+        **_of_held_out(unseen),
     }
     for measure in MEASURES:
         values |= known_values(measure, measure.of_scene(subject))
@@ -129,8 +145,18 @@ def evaluate(
         fit=fit,
         values=values,
         views=(*captured, *inserted),
+        held_out=unseen,
         versions=_versions(),
     )
+
+
+def _of_held_out(rows: Sequence[ViewMetrics]) -> dict[str, float]:
+    """Means over all held-out photos, and none where one has no camera: a method must not gain by what it cannot show."""
+    if not rows:
+        return {}
+    posed = [row for row in rows if row.posed]
+    counts = {"views_held_out": float(len(rows)), "views_held_out_posed": float(len(posed))}
+    return counts | (_means(rows) if len(posed) == len(rows) else {})
 
 
 def _means(rows: Sequence[ViewMetrics]) -> dict[str, float]:

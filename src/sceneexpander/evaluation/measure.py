@@ -6,6 +6,7 @@ outside the package is registered by `register_measure`. Its number is then in e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -53,22 +54,46 @@ class SeenView:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class UnseenView:
+    """A photo that nothing was made from, and what the reconstruction shows at its camera (`evaluation.held_out`).
+
+    Attributes:
+        picture: the photo at the stored size.
+        photo: the same in its own pixels.
+        valid: stored pixels that show the place; None: all.
+        render: the reconstruction at the photo's camera and the stored size, on black.
+        config: settings.
+    """
+
+    picture: Float[Tensor, "3 height width"]
+    photo: Float[Tensor, "3 photo_height photo_width"]
+    valid: Bool[Tensor, "height width"] | None
+    render: Render
+    config: EvaluateConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Subject:
-    """What is measured: a reconstruction, its views' pictures, the camera path it is shown on, and known truth where there is any."""
+    """What is measured: a reconstruction, its views' pictures, the camera path it is shown on, and known truth where there is any.
+
+    ``seen`` are all its views, in its order.
+    """
 
     reconstruction: Reconstruction
     views: ViewSet
     round_number: int
     config: EvaluateConfig
+    seen: tuple[SeenView, ...]
     navigation: Cameras | None = None
     truth: SceneTruth | None = None
 
 
 class Measure(Protocol):
-    """Something that measures reconstructions: view by view, as a whole, or both.
+    """Something that measures reconstructions: view by view, on held-out photos, as a whole, or all of these.
 
     Of numbers of captured views the row has the mean over those with a camera, and none where one of these has none; numbers of inserted
-    views are in the row for the view of its round. ``metrics`` are all that the measure can answer with.
+    views are in the row for the view of its round; of held-out photos it has the mean if all of them have a camera. ``metrics`` are all
+    that the measure can answer with.
     """
 
     metrics: tuple[Metric, ...]
@@ -77,15 +102,21 @@ class Measure(Protocol):
         """Numbers of one view."""
         return {}
 
+    def of_held_out(self, view: UnseenView) -> Values:
+        """Numbers of one photo that nothing was made from."""
+        return {}
+
     def of_scene(self, subject: Subject) -> Values:
         """Numbers of the reconstruction as a whole."""
         return {}
 
 
 def known_values(measure: Measure, values: Values) -> dict[str, float]:
-    """What is defined of an answer. Raises `ValueError` for a number that the measure does not declare."""
+    """What is defined of an answer. Raises `ValueError` for a number that the measure does not declare, or that is not finite."""
     declared = {metric.name for metric in measure.metrics}
-    for name in values:
+    for name, value in values.items():
         if name not in declared:
             raise ValueError(f"{type(measure).__name__} answers with {name!r}, which is none of its metrics")
+        if value is not None and not math.isfinite(value):
+            raise ValueError(f"{type(measure).__name__} answers {name} = {value}, which is no number to average")
     return {name: float(value) for name, value in values.items() if value is not None}

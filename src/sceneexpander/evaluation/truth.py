@@ -15,11 +15,17 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.truth import SceneTruth, ViewTruth, check_size
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
+from sceneexpander.catalogue.metrics import metrics_named
+from sceneexpander.evaluation.image import WINDOW, psnr, ssim
+from sceneexpander.evaluation.measure import Measure, Subject, Values
+from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.geometry.camera import pixel_centres
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.geometry.similarity import umeyama
 
 _WITHIN = 1.25
+_FEWEST_PIXELS = 64  # fewer say nothing about a region
+_MARGIN = WINDOW // 2  # pixels at the border are no centre of a window of SSIM
 _SHORT_BASELINE = 1e-6  # of the largest one: no direction
 
 
@@ -92,6 +98,41 @@ def against_truth(
         new_region_abs_rel=new_errors[0],
         new_region_within_125=new_errors[1],
     )
+
+
+class InsertedRegions(Measure):
+    """The inserted view where no captured view saw the place, and where one did, against its picture at the method's own camera."""
+
+    metrics = metrics_named("psnr_inserted_new_db", "ssim_inserted_new", "psnr_inserted_seen_db", "ssim_inserted_seen")
+
+    def of_scene(self, subject: Subject) -> Values:
+        """Nothing without a known new region; a region too small to say anything has no numbers."""
+        if subject.truth is None:
+            return {}
+        records = {record.view_id: record for record in subject.views.records}
+        values: dict[str, float | None] = {}
+        for view in subject.seen:
+            made = view.reconstruction
+            record = records[made.view_ids[view.index]]
+            known = subject.truth.of(record)
+            if (
+                not view.generated
+                or record.round != subject.round_number
+                or not bool(made.posed[view.index])
+                or known is None
+            ):
+                continue
+            new = _in_stored_pixels(known.new_region, record, *view.picture.shape[1:])
+            if new is None:
+                continue
+            counted = torch.ones_like(new) if view.valid is None else view.valid
+            for name, region in (("new", new & counted), ("seen", ~new & counted)):
+                inner = region[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+                if int(inner.sum()) >= _FEWEST_PIXELS:
+                    rgb = view.render.rgb[0]
+                    values[f"psnr_inserted_{name}_db"] = min(psnr(rgb, view.picture, region), PSNR_CAP_DB)
+                    values[f"ssim_inserted_{name}"] = ssim(rgb, view.picture, region)
+        return values
 
 
 def _in_stored_pixels(plane: Tensor | None, record: ViewRecord, height: int, width: int) -> Tensor | None:

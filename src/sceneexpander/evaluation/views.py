@@ -21,6 +21,7 @@ from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.catalogue import Views, metric_named
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.ghosting import find_ghosting
 from sceneexpander.evaluation.image import psnr, ssim
 from sceneexpander.evaluation.measure import Measure, SeenView, Subject, Values, known_values
 from sceneexpander.evaluation.perceptual import st_lpips
@@ -76,50 +77,56 @@ def same_place(
 
 
 @torch.no_grad()
-def measure_views(
-    reconstruction: Reconstruction,
-    views: ViewSet,
-    config: EvaluateConfig,
-    measures: Sequence[Measure],
-    *,
-    generated: bool,
-) -> tuple[ViewMetrics, ...]:
-    """One row per captured (or generated) view of the reconstruction, in order: rendered there and measured.
+def see_views(reconstruction: Reconstruction, views: ViewSet, config: EvaluateConfig) -> tuple[SeenView, ...]:
+    """Every view of the reconstruction, drawn at its own camera, beside its picture.
 
     Raises:
-        ValueError: a picture is missing or of another size, or a measure mixes up captured and inserted views.
+        ValueError: a picture is missing or of another size.
     """
     if reconstruction.depth.shape[1:] != views.images.shape[2:]:
         raise ValueError(
             f"the reconstruction has {tuple(reconstruction.depth.shape[1:])} pixels, the views {views.height, views.width}"
         )
     picture_of = {record.view_id: i for i, record in enumerate(views.records)}
-    rows = []
-    for index, view_id in enumerate(reconstruction.view_ids):
-        if bool(reconstruction.generated[index]) != generated:
-            continue
+    for view_id in reconstruction.view_ids:
         if view_id not in picture_of:
             raise ValueError(f"no picture of view {view_id!r} was given, only {list(picture_of)}")
-        seen = see_view(reconstruction, index, views, picture_of[view_id], config)
+    return tuple(
+        _see_view(reconstruction, index, views, picture_of[view_id], config)
+        for index, view_id in enumerate(reconstruction.view_ids)
+    )
+
+
+@torch.no_grad()
+def measure_views(seen: Sequence[SeenView], measures: Sequence[Measure], *, generated: bool) -> tuple[ViewMetrics, ...]:
+    """One row per captured (or generated) view, in order.
+
+    Raises:
+        ValueError: a measure mixes up captured and inserted views.
+    """
+    rows = []
+    kind = Views.INSERTED if generated else Views.CAPTURED
+    for view in seen:
+        if view.generated != generated:
+            continue
         values: dict[str, float] = {}
         for measure in measures:
-            values |= known_values(measure, measure.of_view(seen))
-        kind = Views.INSERTED if generated else Views.CAPTURED
+            values |= known_values(measure, measure.of_view(view))
         for name in values:
             if metric_named(name).scope.views is not kind:
                 raise ValueError(f"{name!r} is not a metric of {kind} views")
         rows.append(
             ViewMetrics(
-                view_id=view_id,
+                view_id=view.reconstruction.view_ids[view.index],
                 generated=generated,
-                posed=bool(reconstruction.posed[index]),
+                posed=bool(view.reconstruction.posed[view.index]),
                 values=values,
             )
         )
     return tuple(rows)
 
 
-def see_view(
+def _see_view(
     reconstruction: Reconstruction, index: int, views: ViewSet, place: int, config: EvaluateConfig
 ) -> SeenView:
     """A view of a reconstruction drawn at its own camera, beside its picture, which is the one at ``place`` in ``views``."""
@@ -187,15 +194,20 @@ class AtStoredSize(Measure):
 class FromOthers(Measure):
     """A view painted only by Gaussians that came from *other* views, over the pixels that those cover.
 
-    A picture that agrees with its neighbours scores high, doubled contours (ghosting) score low.
+    A picture that agrees with its neighbours scores high, doubled contours (ghosting) score low. Ghosting itself: `find_ghosting`.
     """
 
-    _captured = ("covered_by_others", "psnr_from_others_db")
-    _inserted = ("inserted_covered_by_others", "psnr_inserted_from_others_db")
+    _captured = ("covered_by_others", "psnr_from_others_db", "structure_ghosted", "structure_offset")
+    _inserted = (
+        "inserted_covered_by_others",
+        "psnr_inserted_from_others_db",
+        "inserted_structure_ghosted",
+        "inserted_structure_offset",
+    )
     metrics = metrics_named(*_captured, *_inserted)
 
     def of_view(self, view: SeenView) -> Values:
-        """Share that is covered, and the PSNR there; nothing for the only view."""
+        """Share that is covered, PSNR and ghosting there; nothing for the only view."""
         whole = view.reconstruction
         if not view.config.cross_view or len(whole.view_ids) < 2:
             return {}
@@ -203,18 +215,24 @@ class FromOthers(Measure):
         found = self._seen_by(others, view)
         return dict(zip(self._inserted if view.generated else self._captured, found, strict=True))
 
-    def _seen_by(self, others: Gaussians, view: SeenView) -> tuple[float, float | None]:
+    def _seen_by(self, others: Gaussians, view: SeenView) -> tuple[float | None, ...]:
         if not len(others):
-            return 0.0, None
+            return 0.0, None, None, None
         whole, index, counted = view.reconstruction, view.index, _counted(view)
         camera = (whole.world_from_cam[index : index + 1], whole.intrinsics_px[index : index + 1])
         seen = render(others, Cameras(*camera, *view.picture.shape[1:]))
         covered = (seen.alpha[0] > view.config.coverage_alpha) & counted
         if int(covered.sum()) < _FEWEST_PIXELS:
-            return _share(covered, counted), None
+            return _share(covered, counted), None, None, None
         # Divided by alpha: what is compared is the colour that is there, not the black behind it.
         colour = seen.rgb[0] / seen.alpha[0].clamp(min=1e-6)
-        return _share(covered, counted), min(psnr(colour, view.picture, covered), PSNR_CAP_DB)
+        ghosts = find_ghosting(view.picture, colour, covered) if view.config.ghosting else None
+        return (
+            _share(covered, counted),
+            min(psnr(colour, view.picture, covered), PSNR_CAP_DB),
+            None if ghosts is None else ghosts.ghosted,
+            None if ghosts is None else ghosts.offset,
+        )
 
 
 class TourCoverage(Measure):

@@ -18,12 +18,11 @@ from sceneexpander.frontend.sfm_types import SparseReconstruction
 _log = logging.getLogger(__name__)
 
 
-def straighten_views(views: ViewSet, found: SparseReconstruction) -> ViewSet:
+def straighten_views(views: ViewSet, distortion: Distortion | None) -> ViewSet:
     """The views as pinhole cameras show them, which is what reconstructors and renderers take; unchanged if no lens bends anything.
 
     Pixels of the frame that the lens did not show become invalid.
     """
-    distortion = found.distortion
     if distortion is None or not distortion.k.any():
         return views
     images, seen = distortion.straightened(views.images)

@@ -36,7 +36,7 @@ def initial_state(
     priors, sparse = views_priors(scene.views, loaded, frontend, seed=seed, known=scene.known, memory=memory)
     views = scene.views
     if sparse is not None:
-        views = straighten_views(views, sparse)
+        views = straighten_views(views, sparse.distortion)
         announce_cameras(report_cameras(views, sparse), strict=frontend.strict)
     loaded.reset()
     report = warm_up(

@@ -185,6 +185,15 @@ def _left_out(rows: Mapping[str, MetricsRow], names: Mapping[str, str]) -> list[
             if posed
             else f"No photo has a camera{who}: the means are over placeholders and say little."
         )
+    held_out = {view.view_id for row in rows.values() for view in row.held_out}
+    if held_out:
+        sentences.append(f"Held out, and in nothing but the numbers of held-out photos: {', '.join(sorted(held_out))}.")
+    for method, row in rows.items():
+        missed = [view.view_id for view in row.held_out if not view.posed]
+        if missed:
+            sentences.append(
+                f"{method}: {', '.join(missed)} has no camera in its scene, so it has no numbers of held-out photos."
+            )
     if any(view.generated and not view.posed for row in rows.values() for view in row.views):
         sentences.append("An inserted view without a camera has no numbers here.")
     return sentences

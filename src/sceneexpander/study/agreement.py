@@ -5,14 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sceneexpander.artifacts.metrics import MetricsRow, load_row
-from sceneexpander.artifacts.store import to_plain, write_json_atomic
+from sceneexpander.artifacts.store import read_json, to_plain, write_json_atomic
 from sceneexpander.catalogue import Table
 from sceneexpander.catalogue.metrics import MEASURED
 from sceneexpander.errors import UserError
@@ -22,10 +22,12 @@ from sceneexpander.study.design import make_numpy_generator
 from sceneexpander.study.results import RankedStudy
 from sceneexpander.study.spec import Criterion
 from sceneexpander.study.statistics import RESAMPLES, Interval, kendall_tau, percentile_interval
+from sceneexpander.typed import decode
 
 SCHEMA = "study agreement/1"
 COLUMNS = ("scene", "method", "measure", "better", "value")
 _CSV_BYTES = 64 * 2**20
+_Results = dict[str, dict[str, dict[str, dict[str, float | str]]]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,14 +68,16 @@ def read_measures(path: Path) -> list[Measured]:
     """Values of measures.
 
     Args:
-        path: a CSV file with the columns scene, method, measure, better ("higher" or "lower") and value (empty: missing), or
-            a folder of the pipeline's outputs, whose ``metrics`` rows are read.
+        path: a CSV file with the columns scene, method, measure, better ("higher" or "lower") and value (empty: missing); a folder of
+            the pipeline's outputs, whose ``metrics`` rows are read; or its ``results/metrics.json``, with a judge's scores.
 
     Raises:
         UserError: it is neither, or a line is not as it should be; names the line.
     """
     if path.is_dir():
         return _read_rows(path)
+    if path.suffix == ".json":
+        return _read_results(path)
     try:
         text = read_plain_file(path, limit_bytes=_CSV_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -121,6 +125,34 @@ def _read_rows(folder: Path) -> list[Measured]:
     ]
     _refuse_doubles(found, folder)
     return found
+
+
+def _read_results(path: Path) -> list[Measured]:
+    """Of the headline numbers: scene, round, method, name."""
+    content = decode(_Results, read_json(path), where=str(path))
+    found = [
+        Measured(
+            scene=scene, method=method, measure=item.name, better=item.better, value=_number(numbers, item.name, path)
+        )
+        for scene, rounds in content.items()
+        for methods in rounds.values()
+        for method, numbers in methods.items()
+        for item in MEASURED
+        if item.better in ("higher", "lower")
+    ]
+    if not found:
+        raise UserError("holds no metrics", where=path, fix="run the pipeline, or give a CSV file")
+    _refuse_doubles(found, path)
+    return found
+
+
+def _number(numbers: Mapping[str, float | str], name: str, path: Path) -> float | None:
+    value = numbers.get(name)
+    if value is None:
+        return None
+    if isinstance(value, str) or not math.isfinite(value):
+        raise UserError(f"{name} is {value!r}", where=path, fix="a finite number, or leave it out")
+    return float(value)
 
 
 def _refuse_doubles(measured: Sequence[Measured], where: Path) -> None:

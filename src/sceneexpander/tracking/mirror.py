@@ -6,10 +6,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sceneexpander.artifacts.cameras import CameraReport
+from sceneexpander.artifacts.judgement import FILE_NAME, JudgedRound
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.page import MethodPage, MissingMethod, RoundPage, ScenePage
 from sceneexpander.catalogue import MAIN
 from sceneexpander.catalogue.methods import CAPTURED, known_method, method_title
+from sceneexpander.evaluation.judged import with_judged
 from sceneexpander.tracking.describe import CAMERAS_TAG, LEFT_OUT_TAG, NOTE_TAG, cut, run_note
 from sceneexpander.tracking.record import RunRecord, run_key
 from sceneexpander.tracking.store import LIVE_TAG
@@ -42,7 +44,9 @@ def scene_runs(
 def _run(
     page: ScenePage, item: RoundPage, method: MethodPage, folder: Path, commit: str, extra: Sequence[Path]
 ) -> RunRecord:
-    row = MetricsRow.load(folder / method.metrics)
+    judgement = folder / f"round_{item.number}"
+    judged = JudgedRound.load(judgement) if (judgement / FILE_NAME).is_file() else None
+    row = with_judged(MetricsRow.load(folder / method.metrics), judged)
     scene, number, name = folder.name, item.number, method.name
     variant = variant_name(page.overrides)
     stages = {stage: run for stage, run in item.statistics.items() if _belongs(stage, name)}

@@ -29,6 +29,7 @@ from sceneexpander.catalogue import (
 )
 from sceneexpander.catalogue.course import COURSE, DRIFT_ALL
 from sceneexpander.catalogue.document import metrics_document
+from sceneexpander.catalogue.metrics import JUDGED
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.evaluate import MEASURES
 from sceneexpander.tracking.tracked import tracked_step
@@ -53,8 +54,9 @@ def test_every_number_of_a_step_and_a_look_is_in_it() -> None:
 def test_what_is_measured_is_measured_by_one_measure() -> None:
     answered = [metric.name for measure in MEASURES for metric in measure.metrics]
     assert len(set(answered)) == len(answered)
-    # Counted by `evaluate` itself, a difference of two rows, and the benchmark's.
+    # Counted by `evaluate` itself, a difference of two rows, a judge's, and the benchmark's.
     elsewhere = {"views_captured", "views_captured_posed", "views_generated", "repeats", "tour_covered_gained"}
+    elsewhere |= {metric.name for metric in JUDGED}
     elsewhere |= {metric.name for metric in measured_metrics() if metric.scope.views is Views.HELD_OUT}
     assert {metric.name for metric in measured_metrics()} == set(answered) | elsewhere
 

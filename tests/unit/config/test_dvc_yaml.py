@@ -76,7 +76,7 @@ def filled(path: str) -> str:
                 layout.selection("S"),
                 *(
                     layout.given("S", kind)
-                    for kind in ("generator", "choice", "judge", "model", *methods_of(Kind.RIVAL))
+                    for kind in ("generator", "choice", "judge", "lpips", "model", *methods_of(Kind.RIVAL))
                 ),
             ],
         ),
@@ -85,11 +85,13 @@ def filled(path: str) -> str:
             [
                 layout.prepared("S"),
                 layout.asked("S", 1).parent,
+                layout.held_out("S"),
                 layout.truth("S"),
                 layout.statistics("prepare", "S"),
             ],
         ),
         ("reconstruct", [layout.state("S", 0), layout.match_memory("S"), layout.statistics("reconstruct", "S")]),
+        ("match_held_out", [layout.matched_held_out("S"), layout.statistics("match_held_out", "S")]),
         ("generate_view", [layout.candidates("S", 2), layout.statistics("generate_view", "S", 2)]),
         ("choose_view", [layout.inserted("S", 2), layout.statistics("choose_view", "S", 2)]),
         (
@@ -148,6 +150,18 @@ def test_outputs_are_where_the_layout_says(stage: str, written: list[Path]) -> N
     assert declared == {path.as_posix() for path in written}
 
 
+def test_held_out_photos_lead_to_nothing_but_what_is_measured_on_them() -> None:
+    def readers(path: Path) -> set[str]:
+        """Stages that depend on what is there, or on a folder around it."""
+        around = {path.as_posix(), *(parent.as_posix() for parent in path.parents)}
+        return {stage for stage in PIPELINE if {filled(dep) for dep in paths(stage, "deps")} & around}
+
+    gathers = {"collect"}  # names its files one by one
+    assert readers(layout.held_out("S")) - gathers == {"match_held_out"}
+    assert readers(layout.matched_held_out("S")) - gathers == {"evaluate"}
+    assert not {layout.held_out("S"), layout.matched_held_out("S")} & set(layout.prepared("S").parents)
+
+
 def test_nothing_persists_but_what_belongs_to_this_machine() -> None:
     persistent = {
         filled(path)
@@ -159,7 +173,7 @@ def test_nothing_persists_but_what_belongs_to_this_machine() -> None:
     }
     given = {
         layout.given("S", kind).as_posix()
-        for kind in ("generator", "choice", "judge", "model", *methods_of(Kind.RIVAL))
+        for kind in ("generator", "choice", "judge", "lpips", "model", *methods_of(Kind.RIVAL))
     }
     # Never restored from the cache of runs (another machine's environment), never copied into it (links to the user's files).
     assert persistent == {"mlflow/tracked.json", layout.CODE.as_posix(), layout.ENVIRONMENT.as_posix()} | given

@@ -11,6 +11,7 @@ from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.earlier import EarlierRegions
 from sceneexpander.evaluation.measure import Subject, Values
+from sceneexpander.evaluation.views import see_views
 from tests.worlds.wall import made_reconstruction, own_pictures
 
 CONFIG = EvaluateConfig(st_lpips=False, cross_view=False)
@@ -29,7 +30,13 @@ def measured(posed: tuple[bool, ...] = (True,) * 4, *, round_number: int = 2, da
         images[damaged] = 1 - images[damaged]
     views = ViewSet(records=records, images=images, detail_images=images)
     return EarlierRegions().of_scene(
-        Subject(reconstruction=made, views=views, round_number=round_number, config=CONFIG)
+        Subject(
+            reconstruction=made,
+            views=views,
+            round_number=round_number,
+            config=CONFIG,
+            seen=see_views(made, views, CONFIG),
+        )
     )
 
 

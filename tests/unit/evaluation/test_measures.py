@@ -112,6 +112,17 @@ def test_a_measure_answers_only_with_what_it_declares() -> None:
         evaluated()
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_number_that_is_none_is_refused_and_not_averaged(value: float) -> None:
+    class Broken(Toy):
+        def of_view(self, view: SeenView) -> Values:
+            return {} if view.generated else {BRIGHTNESS.name: value}
+
+    register_measure(Broken())
+    with pytest.raises(ValueError, match=r"brightness_captured = (nan|inf), which is no number"):
+        evaluated()
+
+
 def test_a_metric_is_measured_once() -> None:
     register_measure(Toy())
     with pytest.raises(ValueError, match="Toy answers with 'brightness_captured' already"):

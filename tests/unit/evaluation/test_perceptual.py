@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
 import sys
 
 import pytest
@@ -52,6 +53,39 @@ def test_values_outside_a_display_do_not_count_and_no_stand_in_stays() -> None:
     for name in ("torchvision", "IPython", "torchsummary"):
         module = sys.modules.get(name)
         assert module is None or module.__spec__ is not None
+
+
+@installed
+@pytest.mark.parametrize(
+    ("change", "rows", "columns", "expected"),
+    [("noise", 96, 128, 0.14834869), ("shift", 96, 128, 0.04361212), ("noise", 61, 93, 0.19906735)],
+)
+def test_values_are_those_of_the_package_with_its_own_blur(
+    change: str, rows: int, columns: int, expected: float
+) -> None:
+    """Recorded once with stlpips-pytorch 0.0.2 as it is."""
+    image = picture()
+    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
+    changed = image + 0.1 * noise if change == "noise" else image.roll(3, -1)
+    assert distance(changed[:, :rows, :columns], image[:, :rows, :columns]) == pytest.approx(expected, abs=1e-5)
+
+
+@installed
+def test_the_packages_blur_module_is_never_imported() -> None:
+    script = (
+        "import sys, torch; from sceneexpander.evaluation.perceptual import st_lpips;"
+        "st_lpips(torch.zeros(3, 64, 64), torch.ones(3, 64, 64));"
+        "print([n for n in sys.modules if n.startswith('stlpips_pytorch.models_lpf')])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_pictures_that_cannot_be_compared_are_refused() -> None:
+    with pytest.raises(ValueError, match="cannot compare"):
+        st_lpips(picture(), picture()[:, 1:])
+    with pytest.raises(ValueError, match="non-finite"):
+        st_lpips(picture() * torch.nan, picture())
 
 
 def test_without_the_package_there_is_no_number(monkeypatch: pytest.MonkeyPatch) -> None:

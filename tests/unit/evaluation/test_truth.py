@@ -20,6 +20,8 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError, sha256_of_file
 from sceneexpander.artifacts.truth import SceneTruth, ViewTruth
 from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.evaluation.truth import TruthMetrics, against_truth
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
@@ -405,3 +407,22 @@ def test_maps_of_another_size_are_found_before_anything_runs(tmp_path: Path) -> 
     check_truth(tmp_path, [record])
     with pytest.raises(ArtifactError, match="truth of 4 x 6 pixels for a picture of 4 x 7"):
         check_truth(tmp_path, [dataclasses.replace(record, original_width=7)])
+
+
+def test_the_inserted_view_is_measured_apart_in_its_new_and_in_its_seen_region() -> None:
+    scene = made_reconstruction()
+    views = own_pictures(scene)
+    new = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    new[:, WIDTH // 2 :] = True
+    images = views.images.clone()
+    images[-1][:, new] = 1 - images[-1][:, new]
+    views = dataclasses.replace(views, images=images, detail_images=images)
+    known = ViewTruth(world_from_cam=scene.world_from_cam[-1], intrinsics_px=scene.intrinsics_px[-1], new_region=new)
+    truth = SceneTruth(views={views.records[-1].sha256: known})
+    config = EvaluateConfig(st_lpips=False, flip=False, ghosting=False, consistency_frames=0)
+    row = evaluate(scene, views, config, scene="s", round_number=1, seed=0, truth=truth)
+    assert row.values["psnr_inserted_new_db"] < 15 < 60 < row.values["psnr_inserted_seen_db"]
+    assert row.values["ssim_inserted_new"] < row.values["ssim_inserted_seen"]
+    nothing = SceneTruth(views={views.records[-1].sha256: dataclasses.replace(known, new_region=torch.zeros_like(new))})
+    empty = evaluate(scene, views, config, scene="s", round_number=1, seed=0, truth=nothing)
+    assert "psnr_inserted_new_db" not in empty.values

@@ -18,7 +18,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import MEASURES, evaluate
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
-from sceneexpander.evaluation.views import measure_views, navigation_coverage, same_place
+from sceneexpander.evaluation.views import measure_views, navigation_coverage, same_place, see_views
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from tests.worlds.wall import HEIGHT, WIDTH, made_reconstruction, own_pictures, without_generated
@@ -27,11 +27,11 @@ CONFIG = EvaluateConfig()
 
 
 def preservation(scene: Reconstruction, views: ViewSet, config: EvaluateConfig) -> tuple[ViewMetrics, ...]:
-    return measure_views(scene, views, config, MEASURES, generated=False)
+    return measure_views(see_views(scene, views, config), MEASURES, generated=False)
 
 
 def insertion_fidelity(scene: Reconstruction, views: ViewSet, config: EvaluateConfig) -> tuple[ViewMetrics, ...]:
-    return measure_views(scene, views, config, MEASURES, generated=True)
+    return measure_views(see_views(scene, views, config), MEASURES, generated=True)
 
 
 def psnr_of(row: ViewMetrics) -> float:
@@ -153,12 +153,18 @@ def test_sizes_must_agree() -> None:
 
 def test_row_holds_everything_and_survives_the_disk(tmp_path: Path) -> None:
     scene = made_reconstruction()
-    row = evaluate(scene, own_pictures(scene), CONFIG, scene="made", round_number=1, seed=0, navigation=scene.cameras)
+    full = dataclasses.replace(CONFIG, consistency_frames=3)
+    row = evaluate(scene, own_pictures(scene), full, scene="made", round_number=1, seed=0, navigation=scene.cameras)
     assert [row.value(name) for name in ("views_captured", "views_generated", "tour_frames")] == [2, 1, 3]
     assert row.value("gaussians") == 3 * HEIGHT * WIDTH
     assert row.value("gaussians_generated") == HEIGHT * WIDTH
     assert row.value("psnr_inserted_db") == PSNR_CAP_DB
     assert row.value("depth_abs_rel") is None
+    assert row.value("tour_registered") is not None
+    without = evaluate(
+        scene, own_pictures(scene), CONFIG, scene="made", round_number=1, seed=0, navigation=scene.cameras
+    )
+    assert without.value("tour_registered") is None
     assert row.numbers()["psnr_captured_db"] == PSNR_CAP_DB
     assert set(row.values) <= {metric.name for metric in measured_metrics()}
     assert "torch" in row.versions
@@ -247,7 +253,7 @@ def test_what_others_show_thinly_is_compared_by_its_colour() -> None:
     config = EvaluateConfig(st_lpips=False, coverage_alpha=0.2)
     pictures = own_pictures(scene)
     solid, seen = (
-        measure_views(one, pictures, config, MEASURES, generated=False)[0].values["psnr_from_others_db"]
+        measure_views(see_views(one, pictures, config), MEASURES, generated=False)[0].values["psnr_from_others_db"]
         for one in (scene, thin)
     )
     assert solid > 30
@@ -256,6 +262,6 @@ def test_what_others_show_thinly_is_compared_by_its_colour() -> None:
 
 def test_the_perceptual_distance_can_be_left_out() -> None:
     scene = made_reconstruction()
-    rows = measure_views(scene, own_pictures(scene), EvaluateConfig(st_lpips=False), MEASURES, generated=False)
+    rows = preservation(scene, own_pictures(scene), EvaluateConfig(st_lpips=False))
     assert rows
     assert not any("st_lpips_captured" in row.values for row in rows)

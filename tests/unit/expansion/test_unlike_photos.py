@@ -143,7 +143,7 @@ def test_a_bent_lens_is_straightened(tmp_path: Path) -> None:
     assert turn < 0.5
     assert direction < 1.0
     assert made.report.views[0].distortion[0] == pytest.approx(-0.22, abs=0.03)
-    straight = straighten_views(made.views, made.found)
+    straight = straighten_views(made.views, made.found.distortion)
     assert straight.records[0].distortion == made.report.views[0].distortion
     # Against the photos as a straight lens takes them, where both show something: the warp is right to a fraction of a pixel.
     plain = read_views(photos(tmp_path, lambda picture, number: picture), IngestConfig()).views

@@ -12,7 +12,7 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
-from sceneexpander.evaluation.views import AtStoredSize, measure_views
+from sceneexpander.evaluation.views import AtStoredSize, measure_views, see_views
 from sceneexpander.geometry.camera import project_points
 from sceneexpander.geometry.gaussians import ROWS
 from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
@@ -27,7 +27,7 @@ SHORT = OptimiseConfig(
 
 
 def psnr(reconstruction: Reconstruction, views: ViewSet = VIEWS) -> float:
-    rows = measure_views(reconstruction, views, EvaluateConfig(), [AtStoredSize()], generated=False)
+    rows = measure_views(see_views(reconstruction, views, EvaluateConfig()), [AtStoredSize()], generated=False)
     return sum(row.values["psnr_captured_db"] for row in rows) / len(rows)
 
 

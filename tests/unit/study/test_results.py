@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -223,6 +224,30 @@ def test_tau_between_people_and_measures_by_hand() -> None:
     assert found["one participant"].tau == pytest.approx((1 + 1 / 3) / 2)
     table = agreement_table(list(found.values()), 2)
     assert {len(line) for line in table.lines} == {len(table.header)}
+
+
+def test_the_pipelines_headline_numbers_and_its_judge_are_measures(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    scores = {"a": 5.0, "b": 3.0, "c": 1.0}
+    numbers: dict[str, Any] = {}
+    for scene in ("one", "two"):
+        methods: dict[str, Any] = {
+            name: {"psnr_captured_db": -score, "judge_insertion": score} for name, score in scores.items()
+        }
+        numbers[scene] = {"round_1": methods | {"omnivggt": {"unavailable": "needs its checkpoint"}}}
+    path.write_text(json.dumps(numbers))
+    ranked = ranked_by([[1, 2, 3], [1, 2, 3]], [[1, 2, 3], [1, 2, 3]])
+    found = {
+        item.measure: item
+        for item in compute_agreement(ranked, read_measures(path))
+        if item.criterion is Criterion.INSERTION
+    }
+    assert (found["judge_insertion"].tau, found["psnr_captured_db"].tau) == (1, -1)
+    assert found["judge_quality"].tau is None
+    numbers["one"]["round_1"]["a"]["psnr_captured_db"] = float("nan")
+    path.write_text(json.dumps(numbers))
+    with pytest.raises(UserError, match=r"metrics\.json"):
+        read_measures(path)
 
 
 def test_what_two_files_say_about_the_same_thing_is_refused() -> None:
