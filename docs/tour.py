@@ -17,13 +17,13 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.expansion import (
+    MethodConfig,
     RoundInputs,
-    adapt_round,
     captured_prediction,
+    compose_procedure,
     initial_state,
     joint_reconstruction,
     load_model,
-    refined_round,
 )
 from sceneexpander.generation import GenerationContext, check_round
 from sceneexpander.ingest import load_scene
@@ -60,9 +60,9 @@ def expand_courtyard(overrides: Sequence[str]) -> tuple[Reconstruction, Reconstr
 
     # Algorithm 1 between its corrections, then the fit of the Gaussians to the pictures.
     inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
-    state, expanded, _ = adapt_round(inputs, loaded, config.adapt, seed=config.seed)
-    expanded, _ = refined_round(expanded, state, config.adapt, config.refine, seed=config.seed, device=config.device)
-    return backbone, expanded
+    method = MethodConfig(adapt=config.adapt, corrections=config.corrections)
+    expanded = compose_procedure(method, config.refine).run(inputs, loaded, seed=config.seed)
+    return backbone, expanded.scene
 
 
 def main(folder: Path, overrides: Sequence[str]) -> None:

@@ -19,7 +19,6 @@ from pathlib import Path
 import torch
 from rich.progress import Progress
 
-from sceneexpander.adaptation.warmup import WarmupConfig, WarmupReport, warm_up
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
@@ -36,6 +35,9 @@ from sceneexpander.models.mini.training.scores import (
     score_samples,
 )
 from sceneexpander.models.weights import resolve_weights
+from sceneexpander.photometric.config import WarmupConfig
+from sceneexpander.photometric.report import FitReport
+from sceneexpander.photometric.warmup import warm_up
 from sceneexpander.project import find_project
 
 FIRST_SEED = 800_001  # of the held-out stream; training and validation draw from others
@@ -70,7 +72,7 @@ class Scored:
     """The numbers of one scene."""
 
     scores: SceneScores
-    warm_up: WarmupReport | None
+    warm_up: FitReport | None
 
 
 def score(job: Job) -> Scored:
@@ -83,7 +85,7 @@ def score(job: Job) -> Scored:
     return Scored(scores=scores, warm_up=report)
 
 
-def warm_up_bars(reports: Sequence[WarmupReport]) -> list[Bar]:
+def warm_up_bars(reports: Sequence[FitReport]) -> list[Bar]:
     """What the warm-up does to the error on cells that it does not see; it is put back where that does not fall."""
     changes = torch.tensor([report.after / report.before - 1 for report in reports])
     rows = (

@@ -1,4 +1,4 @@
-"""Rows of the ablation on scene folders without known truth: python scripts/real_ablation.py FOLDER ... --rows full,none
+"""Rows of the ablation on scene folders without known truth: python scripts/real_ablation.py FOLDER ... --rows paper,default
 
 A folder is as in ``scenes/`` (photos in captured/, a scene.yaml whose first round names an inserted picture). Prints one line per row and
 seed: what preservation and insertion can be measured without truth. The pre-insertion scene and the baseline are always there.
@@ -12,7 +12,6 @@ from pathlib import Path
 
 import torch
 
-from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import ViewSet, save_png
 from sceneexpander.catalogue.metrics import metrics_named
@@ -23,16 +22,16 @@ from sceneexpander.errors import UserError, entry_point
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.expansion import (
+    MethodConfig,
     RoundInputs,
-    adapt_round,
     captured_prediction,
+    compose_procedure,
     initial_state,
     joint_reconstruction,
-    refined,
-    refined_round,
 )
 from sceneexpander.generation import GenerationContext, check_round
 from sceneexpander.ingest import load_scene
+from sceneexpander.photometric.fitting import fit_to_views
 from sceneexpander.project import find_project
 from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
@@ -60,7 +59,7 @@ def pictures(reconstruction: Reconstruction, path: Path) -> None:
 
 def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], out: Path | None) -> None:
     """Print all lines of one scene."""
-    config = composed("none", overrides)
+    config = composed("default", overrides)
     loaded = load_model(config.model, config.device)
     scene = load_scene(folder, config.scene)
     state, _, _, _ = initial_state(scene, loaded, config.frontend, config.warmup, seed=config.seed)
@@ -85,13 +84,13 @@ def run(folder: Path, rows: list[str], overrides: list[str], seeds: list[int], o
     made: dict[str, Reconstruction] = {}
     for seed in seeds:  # of the adaptation and of the fit: lines of one seed differ in nothing but the row
         for name, reconstruction, shown in (("captured", captured, state.views), ("baseline", backbone, views)):
-            made[name], _ = refined(reconstruction, shown, config.refine, doubt_generated=False, seed=seed)
+            made[name], _ = fit_to_views(reconstruction, shown, config.refine, seed=seed, device=config.device)
             print(line(f"{name} seed {seed}", made[name], views), flush=True)
         for row in rows:
-            adapt: AdaptConfig = replace(composed(row, overrides).adapt, checkpoint_every=0)
-            expanded, reconstruction, _ = adapt_round(inputs, loaded, adapt, seed=seed)
+            own = composed(row, overrides)
+            method = MethodConfig(adapt=replace(own.adapt, checkpoint_every=0), corrections=own.corrections)
             # Fitted to the pictures that the round worked with, and measured on the ones that were given.
-            made[row], _ = refined_round(reconstruction, expanded, adapt, config.refine, seed=seed)
+            made[row] = compose_procedure(method, own.refine).run(inputs, loaded, seed=seed).scene
             print(line(f"{row} seed {seed}", made[row], views), flush=True)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -105,7 +104,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="+", type=Path)
-    parser.add_argument("--rows", default="full,none")
+    parser.add_argument("--rows", default="paper,default")
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--set", default=[], action="append", metavar="KEY=VALUE", help="configuration override")
     parser.add_argument("--out", type=Path, help="folder for pictures")

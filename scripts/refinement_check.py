@@ -24,8 +24,8 @@ from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.sizes import at_sizes
 from sceneexpander.expansion import initial_state
 from sceneexpander.ingest import load_scene
-from sceneexpander.optimisation.config import RefineConfig
-from sceneexpander.optimisation.refine import refine
+from sceneexpander.photometric.config import RefineConfig
+from sceneexpander.photometric.refine import refine
 from sceneexpander.project import find_project
 from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render

@@ -15,8 +15,17 @@ from sceneexpander.artifacts.live import LiveLog
 from sceneexpander.artifacts.state import ExpansionState, load_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, RoundInputs, adapt_round, judge_round, load_model, refined_round
-from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.expansion import (
+    CorrectionsConfig,
+    MethodConfig,
+    ModelConfig,
+    RoundInputs,
+    Watch,
+    compose_procedure,
+    judge_round,
+    load_model,
+)
+from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.progress import progress_bar
 from stages import layout
 from stages.machine import use_machine
@@ -36,6 +45,7 @@ class Sections:
     threads: int
     model: ModelConfig
     adapt: AdaptConfig
+    corrections: CorrectionsConfig
     refine: RefineConfig
 
 
@@ -67,6 +77,8 @@ def main(cell: Cell) -> None:
         remove_folder(checkpoints)
         remove_folder(live / LOOKS)
     loaded = load_model(sections.model, sections.device)
+    method = MethodConfig(adapt=sections.adapt, corrections=sections.corrections)
+    procedure = compose_procedure(method, sections.refine)
     log = LiveLog(live, {"scene": cell.scene, "round": cell.round, "steps": sections.adapt.steps, "sections": sections})
     with progress_bar(f"adapt {cell.scene} round {cell.round}", sections.adapt.steps) as bar:
 
@@ -77,34 +89,21 @@ def main(cell: Cell) -> None:
         def on_look(look: Look) -> None:
             log.write("look", look)
 
-        state, reconstruction, result = adapt_round(
-            inputs,
-            loaded,
-            sections.adapt,
-            seed=sections.seed,
-            checkpoint_folder=checkpoints,
-            on_step=on_step,
-            on_look=on_look,
-            looks_folder=live / LOOKS,
-        )
-    turns = sections.refine.visits * int(reconstruction.posed.sum())
-    with progress_bar(f"refine {cell.scene} round {cell.round}", turns) as bar:
-        reconstruction, fit = refined_round(
-            reconstruction,
-            state,
-            sections.adapt,
-            sections.refine,
-            seed=sections.seed,
-            device=sections.device,
-            on_step=lambda step, loss: bar.update(step, loss),
+        watch = Watch(on_step=on_step, on_look=on_look, checkpoint_folder=checkpoints, looks_folder=live / LOOKS)
+        adapted = procedure.adapt(inputs, loaded, seed=sections.seed, watch=watch)
+    result, posed = adapted.result, adapted.inputs.joint_priors.posed
+    count = len(adapted.inputs.views) if posed is None else int(posed.sum())
+    with progress_bar(f"refine {cell.scene} round {cell.round}", procedure.fit.visits * count) as bar:
+        expanded = procedure.finish(
+            adapted, loaded, seed=sections.seed, on_fit_step=lambda step, loss: bar.update(step, loss)
         )
     warnings = warnings_of(result.looks)
     with directory_being_written(layout.state(cell.scene, cell.round)) as folder:
-        state.save(folder)
-        reconstruction.save(folder / "reconstruction")
-        if fit is not None:
-            write_json_atomic(folder / layout.REFINEMENT, fit)
-        write_json_atomic(folder / "corrections.json", result.corrections)
+        expanded.state.save(folder)
+        expanded.scene.save(folder / "reconstruction")
+        if expanded.fit is not None:
+            write_json_atomic(folder / layout.REFINEMENT, expanded.fit)
+        write_json_atomic(folder / "corrections.json", expanded.corrections)
         if verdict is not None:
             write_json_atomic(folder / "acceptance.json", verdict)
         write_json_atomic(folder / "log.json", [asdict(record) for record in result.records])

@@ -29,7 +29,7 @@ class Sections:
 
 @stage("scene", "round", "previous")
 def main(cell: Cell) -> None:
-    """Check, rank, choose; the contact sheet shows all candidates."""
+    """Check, rank, choose; the contact sheet shows all candidates, the overlay how the chosen one goes with the scene."""
     sections = read_sections(layout.config(cell.scene), Sections)
     use_machine(sections.threads)
     made = CandidateSet.load(layout.candidates(cell.scene, cell.round))
@@ -44,6 +44,8 @@ def main(cell: Cell) -> None:
     with directory_being_written(layout.inserted(cell.scene, cell.round)) as folder:
         chosen.inserted.save(folder)
         save_png(folder / "sheet.png", chosen.sheet)
+        if chosen.overlay is not None:
+            save_png(folder / "overlay.png", chosen.overlay)
 
 
 if __name__ == "__main__":

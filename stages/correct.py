@@ -10,8 +10,15 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.state import ExpansionState, load_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import ModelConfig, RoundInputs, correct_round, load_model, refined_round
-from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.expansion import (
+    CorrectionsConfig,
+    MethodConfig,
+    ModelConfig,
+    RoundInputs,
+    compose_procedure,
+    load_model,
+)
+from sceneexpander.photometric.config import RefineConfig
 from stages import layout
 from stages.machine import use_machine
 from stages.runner import Cell, left_out, stage
@@ -26,12 +33,13 @@ class Sections:
     threads: int
     model: ModelConfig
     adapt: AdaptConfig
+    corrections: CorrectionsConfig
     refine: RefineConfig
 
 
 @stage("scene", "round", "previous", "method")
 def main(cell: Cell) -> None:
-    """Cameras, colour, trust and closed gaps as `adapt` has them, and the same fit, without its steps."""
+    """The procedure of `adapt` without its steps."""
     if left_out(cell):
         return
     sections = read_sections(layout.config(cell.scene), Sections)
@@ -43,15 +51,13 @@ def main(cell: Cell) -> None:
         joint_priors=load_priors(layout.joint_priors(cell.scene, cell.round)),
     )
     loaded = load_model(sections.model, sections.device)
-    state, reconstruction, corrections = correct_round(inputs, loaded, sections.adapt, seed=sections.seed)
-    reconstruction, fit = refined_round(
-        reconstruction, state, sections.adapt, sections.refine, seed=sections.seed, device=sections.device
-    )
+    method = MethodConfig(adapt=sections.adapt, corrections=sections.corrections)
+    corrected = compose_procedure(method, sections.refine).without_steps().run(inputs, loaded, seed=sections.seed)
     with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
-        reconstruction.save(folder / "reconstruction")
-        write_json_atomic(folder / "corrections.json", corrections)
-        if fit is not None:
-            write_json_atomic(folder / layout.REFINEMENT, fit)
+        corrected.scene.save(folder / "reconstruction")
+        write_json_atomic(folder / "corrections.json", corrected.corrections)
+        if corrected.fit is not None:
+            write_json_atomic(folder / layout.REFINEMENT, corrected.fit)
 
 
 if __name__ == "__main__":

@@ -64,6 +64,11 @@ def state(scene: str, number: int) -> Path:
     return round_folder(scene, number) / MAIN
 
 
+def match_memory(scene: str) -> Path:
+    """The `MatchMemory` of the captured views; empty for models that need no cameras."""
+    return round_folder(scene, 0) / "matches"
+
+
 def reconstruction(scene: str, number: int, method: str) -> Path:
     """The `Reconstruction` that a method made in a round, or why there is none (`Unavailable`)."""
     return round_folder(scene, number) / method / "reconstruction"

@@ -8,8 +8,8 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import ExpansionState
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.optimisation.config import RefineConfig
-from sceneexpander.reconstruction.fitting import fitted
+from sceneexpander.photometric.config import RefineConfig
+from sceneexpander.photometric.fitting import fit_to_views
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
 from sceneexpander.reconstruction.views import captured_prediction
 from stages import layout
@@ -40,7 +40,7 @@ def main(cell: Cell) -> None:
         last = Reconstruction.load(layout.reconstruction(cell.scene, cell.previous, "sceneexpander"))
         reconstruction, fit = replace(last, method="captured"), None
     else:
-        reconstruction, fit = fitted(
+        reconstruction, fit = fit_to_views(
             reconstruction, state.views, sections.refine, seed=sections.seed, device=sections.device
         )
     with directory_being_written(layout.anchors(cell.scene, cell.round)) as folder:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
-from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
+from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.photometric.config import WarmupConfig
 from sceneexpander.progress import progress_bar
 from sceneexpander.reconstruction.cameras import report_cameras
 from sceneexpander.reconstruction.initial import initial_state
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+from sceneexpander.reconstruction.memory import save_memory
 from stages import layout
 from stages.machine import use_machine
 from stages.runner import Cell, stage
@@ -37,6 +39,7 @@ def main(cell: Cell) -> None:
     use_machine(sections.threads)
     scene = Scene.load(layout.prepared(cell.scene))
     loaded = load_model(sections.model, sections.device)
+    memory = MatchMemory()
     with progress_bar(f"warm-up {cell.scene}", sections.warmup.steps) as bar:
         state, reconstruction, sparse, warmup = initial_state(
             scene,
@@ -45,8 +48,11 @@ def main(cell: Cell) -> None:
             sections.warmup,
             seed=sections.seed,
             on_step=lambda step, loss: bar.update(step, loss),
+            memory=memory,
         )
     cameras = None if sparse is None else report_cameras(state.views, sparse)
+    with directory_being_written(layout.match_memory(cell.scene)) as folder:
+        save_memory(folder, memory)
     with directory_being_written(layout.state(cell.scene, 0)) as folder:
         if cameras is not None:
             cameras.save(layout.cameras(folder))
@@ -56,7 +62,7 @@ def main(cell: Cell) -> None:
             "model": loaded.model.name,
             "weights_sha256": loaded.weights_sha256,
             "licence": loaded.licence,
-            "warmup": None if warmup is None else asdict(warmup),
+            "warmup": None if warmup is None else asdict(warmup) | {"accepted": warmup.accepted},
             "sparse_points": None if sparse is None else int(sparse.sparse.points_world.shape[0]),
         }
         write_json_atomic(folder / "report.json", facts)

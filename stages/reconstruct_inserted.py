@@ -9,10 +9,11 @@ from sceneexpander.artifacts.state import ExpansionState, save_priors
 from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.photometric.config import RefineConfig
+from sceneexpander.photometric.fitting import fit_to_views
 from sceneexpander.reconstruction.cameras import report_cameras
-from sceneexpander.reconstruction.fitting import fitted
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+from sceneexpander.reconstruction.memory import load_memory
 from sceneexpander.reconstruction.views import joint_reconstruction
 from stages import layout
 from stages.machine import use_machine
@@ -40,9 +41,14 @@ def main(cell: Cell) -> None:
     inserted = InsertedView.load(layout.inserted(cell.scene, cell.round))
     loaded = load_model(sections.model, sections.device)
     priors, reconstruction, sparse = joint_reconstruction(
-        state, inserted, loaded, sections.frontend, seed=sections.seed
+        state,
+        inserted,
+        loaded,
+        sections.frontend,
+        seed=sections.seed,
+        memory=load_memory(layout.match_memory(cell.scene)),
     )
-    reconstruction, fit = fitted(
+    reconstruction, fit = fit_to_views(
         reconstruction,
         state.views.append(inserted.view),
         sections.refine,

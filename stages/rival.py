@@ -8,7 +8,7 @@ from sceneexpander.artifacts.store import directory_being_written, write_json_at
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_sections
 from sceneexpander.inference.config import NEEDS_CHECKPOINT, RivalsConfig
-from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.photometric.config import RefineConfig
 from stages import layout
 from stages.runner import Cell, left_out, stage
 
@@ -43,7 +43,7 @@ def main(cell: Cell) -> None:
     from sceneexpander.artifacts.views import ViewSet
     from sceneexpander.inference.rivals import reconstruct_rival
     from sceneexpander.models.registry import licence_of
-    from sceneexpander.reconstruction.fitting import fitted
+    from sceneexpander.photometric.fitting import fit_to_views
     from stages.machine import use_machine
 
     use_machine(sections.threads)
@@ -53,7 +53,7 @@ def main(cell: Cell) -> None:
     made = reconstruct_rival(cell.method, config, views, priors, device=sections.device)
     fit = None
     if isinstance(made, Reconstruction):
-        made, fit = fitted(made, views, sections.refine, seed=sections.seed, device=sections.device)
+        made, fit = fit_to_views(made, views, sections.refine, seed=sections.seed, device=sections.device)
     with directory_being_written(target) as folder:
         made.save(folder / "reconstruction")
         if isinstance(made, Reconstruction):

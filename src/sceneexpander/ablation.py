@@ -12,10 +12,10 @@ import argparse
 import platform
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
@@ -30,12 +30,12 @@ from sceneexpander.expandbench.report import report
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings, run
 from sceneexpander.expandbench.scenes import DEVELOPMENT, SCENES, TEST
 from sceneexpander.expandbench.studies import BEYOND, CONTROLS, STUDIES, TABLE, Study
+from sceneexpander.expansion import MethodConfig
 from sceneexpander.fingerprint import SourceTree
 from sceneexpander.project import find_project
 
 GRADES_BY_DEFAULT = ("mixed_2",)
 SPLITS = {"development": DEVELOPMENT, "test": TEST}
-RENAMED = {"control_no_adaptation": "corrected"}
 OWN_TABLE = ("scenes", "grades", "rows", "seeds")
 
 
@@ -44,7 +44,12 @@ def make_parser() -> CommandParser:
     parser = CommandParser(
         "ablation",
         "Measure what each part of the method does, on procedural worlds whose cameras and depths are known.",
-        examples=["", "--study rows,long", "--finished", "--rows full,none --grades mixed_2 --seeds 0 adapt.steps=60"],
+        examples=[
+            "",
+            "--study rows,long",
+            "--finished",
+            "--rows paper,default --grades mixed_2 --seeds 0 adapt.steps=60",
+        ],
     )
     parser.add_argument(
         "overrides", nargs="*", metavar="key=value", default=[], help="for every row, e.g. adapt.steps=60"
@@ -91,14 +96,17 @@ def make_plan(
         grade_named(grade)
     if not all(seed.isdigit() for seed in seeds):
         raise UserError(f"is {','.join(seeds)!r}", where="--seeds", fix="give whole numbers, e.g. 0,1,2")
-    configs: dict[str, AdaptConfig] = {}
+    shared = _composed(project, list(more), experiment)
+    methods: dict[str, MethodConfig] = {}
     for row in rows:
-        if row in RENAMED:
-            raise UserError(f"there is no row {row!r} any more", where="--rows", fix=f"it is called {RENAMED[row]!r}")
         if row not in (CAPTURED, BASELINE):
-            configs[row] = _composed(project, [f"ablation={row}", *more], experiment).adapt
-    plan = Plan(scenes=tuple(scenes), grades=tuple(grades), rows=configs, seeds=tuple(int(seed) for seed in seeds))
-    return plan, _composed(project, list(more), experiment)
+            own = _composed(project, [f"ablation={row}", *more], experiment)
+            methods[row] = MethodConfig(adapt=own.adapt, corrections=own.corrections)
+            if replace(own, adapt=shared.adapt, corrections=shared.corrections) != shared:
+                fix = "give what it changes as key=value, for all rows"
+                raise UserError(f"row {row!r} changes what all rows of a table share", where="--rows", fix=fix)
+    plan = Plan(scenes=tuple(scenes), grades=tuple(grades), rows=methods, seeds=tuple(int(seed) for seed in seeds))
+    return plan, shared
 
 
 def _composed(project: Path, overrides: Sequence[str], experiment: str = "expandbench") -> ProjectConfig:

@@ -1,6 +1,7 @@
 """Your own photos, one command: ``sceneexpander expand PHOTOS --prompt "..." --inserted PICTURE``.
 
-``PHOTOS`` is a folder of photos, or a scene folder with a ``scene.yaml``. The picture beyond their boundary is your own (``--inserted``),
+``PHOTOS`` is a folder of photos, a scene folder with a ``scene.yaml``, a video, a COLMAP model, a ``transforms.json``, or what else
+`sceneexpander.ingest.sources` reads. The picture beyond their boundary is your own (``--inserted``),
 or made from the words (``--generator``). Runs in ``runs/NAME`` and prints where the report is. Methods and settings are those of the
 project's params.yaml; ``key=value`` adds to them.
 """
@@ -29,10 +30,12 @@ from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point, printable
 from sceneexpander.generation import Forecast, backend_of
-from sceneexpander.ingest import make_round, read_picture, safe_name, scene_files, survey_pictures
+from sceneexpander.ingest import IngestConfig, make_round, read_picture, safe_name, scene_files
+from sceneexpander.ingest.sources import read_capture
+from sceneexpander.ingest.sources.posed import write_posed_photos
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.locks import run_lock
-from sceneexpander.plainfiles import require_folder, require_plain_file
+from sceneexpander.plainfiles import require_plain_file
 from sceneexpander.preflight import check_scene
 from sceneexpander.processes import ended_by_signals
 from sceneexpander.project import find_project
@@ -71,7 +74,10 @@ def make_parser() -> CommandParser:
         ],
     )
     parser.add_argument(
-        "photos", type=Path, metavar="PHOTOS", help="folder of photos, or a scene folder with scene.yaml"
+        "photos",
+        type=Path,
+        metavar="PHOTOS",
+        help="folder of photos, scene folder with scene.yaml, video, COLMAP model, transforms.json",
     )
     parser.add_argument("--inserted", type=Path, action="append", default=[], help="picture to insert, one per round")
     parser.add_argument("--prompt", action="append", default=[], help="what to add, one per round")
@@ -116,18 +122,18 @@ def parse_arguments(arguments: Sequence[str]) -> Request:
 
 
 def stage_scene(
-    request: Request, name: str, target: Path, *, max_megapixels: float = 200.0, recorded: bool = True
+    request: Request, name: str, target: Path, *, ingest: IngestConfig | None = None, recorded: bool = True
 ) -> None:
     """Put the scene together as a folder with ``scene.yaml``: a copy of a scene folder, or made from photos and options.
 
-    A copy holds what ``scene.yaml`` names and nothing else, as plain files that can be written. Pictures to insert may have
-    ``max_megapixels``; photos are read later, under the same limit. ``recorded``: every round needs a picture of the user's.
+    A copy holds what ``scene.yaml`` names and nothing else, as plain files that can be written. Photos are read later; ``ingest`` says how,
+    and what is taken of a video or of more posed pictures than are used. ``recorded``: every round needs a picture of the user's.
 
     Raises:
         UserError: the folder, a picture or an option is unusable.
     """
     photos = request.photos
-    require_folder(photos, expected="a folder of photos")
+    require_readable(photos)
     words = (request.prompts, request.motions, request.objects, request.inserted)
     if (photos / SCENE_FILE).is_file():
         if any(words):
@@ -147,9 +153,14 @@ def stage_scene(
         )
         for k in range(max(count, 1))
     ]
-    survey = survey_pictures(photos)
-    for path in survey.pictures:
-        _copy(path, target / "captured" / path.name)
+    ingest = IngestConfig() if ingest is None else ingest
+    capture = read_capture(photos, ingest)
+    if any(shot.calibrated or shot.mask or shot.depth or isinstance(shot.picture, bytes) for shot in capture.shots):
+        write_posed_photos(capture, target / "captured", ingest)
+    else:
+        for shot in capture.shots:
+            if isinstance(shot.picture, Path):
+                _copy(shot.picture, target / "captured" / shot.picture.name)
     rounds = []
     for k, spec in enumerate(specs):
         words_of_round = {"prompt": spec.prompt, "motion": spec.motion, "object": spec.new_object}
@@ -157,7 +168,7 @@ def stage_scene(
         if k < len(request.inserted):
             source = request.inserted[k]
             require_plain_file(source)
-            read_picture(source, max_megapixels=max_megapixels)
+            read_picture(source, max_megapixels=ingest.max_megapixels)
             copy = _inserted_name(k + 1, source)
             _copy(source, target / copy)
             facts["inserted"] = copy.as_posix()
@@ -165,7 +176,7 @@ def stage_scene(
             raise UserError(f"round {k + 1} has no picture", where="--inserted", fix=_NO_PICTURE)
         rounds.append(facts)
     # The copy holds nothing but photos: what else was there is told by the notes alone.
-    content = {"name": name, "rounds": rounds, **({"notes": list(survey.notes)} if survey.notes else {})}
+    content = {"name": name, "rounds": rounds, **({"notes": list(capture.notes)} if capture.notes else {})}
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     (target / SCENE_FILE).write_text(text, encoding="utf-8")
 
@@ -193,16 +204,34 @@ def _at(items: Sequence[str], index: int) -> str:
     return items[index] if index < len(items) else ""
 
 
+def require_readable(place: Path) -> None:
+    """Raise `UserError` unless ``place`` leads to a folder or a plain file."""
+    try:
+        if place.is_dir():
+            return
+    except (OSError, ValueError):
+        pass  # the next call says what is wrong
+    require_plain_file(place)
+
+
 def run_name(request: Request) -> str:
     """The name of the run and of its scene: the one that was asked for, or the folder's, in plain letters.
 
     Raises:
         UserError: the pipeline itself uses this name.
     """
-    given = request.name if request.name is not None else request.photos.resolve().name
+    given = request.name if request.name is not None else _place_name(request.photos)
     name = safe_name(given, fallback="scene")
     check_name(name, where="--name" if request.name is not None else request.photos, fix="choose another --name")
     return name
+
+
+def _place_name(place: Path) -> str:
+    """Of a file its name without the ending; of a ``transforms.json`` that of its folder."""
+    place = place.resolve()
+    if place.is_dir():
+        return place.name
+    return place.parent.name if place.suffix.casefold() == ".json" else place.stem
 
 
 def check_source(folder: Path, request: Request) -> None:
@@ -250,7 +279,7 @@ def expand(request: Request, *, project: Path) -> Path | None:
         RuntimeError: a stage failed for another reason.
     """
     _check_words(request)
-    require_folder(request.photos, expected="a folder of photos")
+    require_readable(request.photos)
     name = run_name(request)
     folder = project / "runs" / name
     base = read_selection(project)
@@ -266,7 +295,7 @@ def expand(request: Request, *, project: Path) -> Path | None:
         with _scratch(folder) as scratch:
             scene = scratch / name
             with _shown_as_given(scene, request):
-                stage_scene(request, name, scene, max_megapixels=config.scene.max_megapixels, recorded=recorded)
+                stage_scene(request, name, scene, ingest=config.scene, recorded=recorded)
                 checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
             announce_forecasts(checked.forecasts, config.generator.backend, details=request.dry_run)
             if request.dry_run:

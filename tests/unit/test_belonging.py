@@ -222,6 +222,7 @@ def test_a_configuration_names_its_files(tmp_path: Path, monkeypatch: pytest.Mon
     values = {
         "generator": {"backend": "file", "file": "p_{round}.png"},
         "choose": {"candidate": "auto", "fit": "crop"},
+        "judge": {"backend": "none"},
         "model": {"weights": "w.safetensors"},
         "rivals": {"omnivggt": {"weights": None}, "ttt3r": {"weights": "org/name@main"}},
     }

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
     [
         (["--multirun", "nope=1"], "nope: unknown key"),
         (["--multirun", "adapt.stepz=1,2"], "adapt.stepz: unknown key; did you mean 'adapt.steps'?"),
-        (["--multirun", "ablation=full,ful"], "ablation: has no option 'ful'; did you mean 'full'?"),
+        (["--multirun", "ablation=paper,papr"], "ablation: has no option 'papr'; did you mean 'paper'?"),
         (["--multirun", "ablation=glob(zz*)"], "stands for no value"),
         (["--multirun", "adapt.steps=5,abc"], "adapt.steps: is 'abc' (str), expected a whole number"),
         (["adapt.steps=abc"], "adapt.steps: is 'abc' (str)"),
@@ -93,7 +93,7 @@ def scenes_of(project: Path, *names: str) -> None:
 )
 def test_scenes_are_an_axis(axis: str, expected: list[str], project: Path) -> None:
     scenes_of(project, "a", "b", "c")
-    axes = check_axes(["--multirun", axis, "ablation=full,anchor"], project)
+    axes = check_axes(["--multirun", axis, "ablation=paper,anchor"], project)
     assert list(dict.fromkeys(job.scene for job in axes.jobs)) == expected
     assert f"+swept_scene={','.join(expected)}" in axes.arguments
     assert axis not in axes.arguments

@@ -52,7 +52,7 @@ def test_later_overrides_stand_and_files_become_absolute(tmp_path: Path, monkeyp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "w.safetensors").write_text("x")
     merged = merged_overrides(
-        ("seed=0", "ablation=full"), ("ablation=anchor", "model.weights=w.safetensors"), project=tmp_path
+        ("seed=0", "ablation=paper"), ("ablation=anchor", "model.weights=w.safetensors"), project=tmp_path
     )
     assert merged == ("seed=0", "ablation=anchor", f"model.weights={tmp_path / 'w.safetensors'}")
     assert merged_overrides((), ("model.weights=org/name@main",), project=tmp_path) == ("model.weights=org/name@main",)

@@ -48,22 +48,11 @@ class InsertedWeights(StrEnum):
     CONSISTENT = "consistent"
 
 
-class Realign(StrEnum):
-    """What happens to the front-end's estimate before the adaptation: nothing; captured views keep what was known of them before
-    the insertion and the inserted one follows; the inserted camera is also refined against the captured scene; or whichever of
-    the first two shows the captured photos better."""
-
-    NONE = "none"
-    HOLD = "hold"
-    REFINE = "refine"
-    CHOOSE = "choose"
-
-
 class Spend(StrEnum):
     """When the steps of Algorithm 1 are run: always (the paper), or only where they have something to repair.
 
     ``where_moved``: where the unadapted model gives the captured views another depth beside the inserted view than without it, see
-    `sceneexpander.adaptation.acceptance.captured_moved`.
+    `sceneexpander.insertion.acceptance.captured_moved`.
     """
 
     ALWAYS = "always"
@@ -169,22 +158,13 @@ class AdaptConfig:
     drift: DriftForm = DriftForm.SUM
     gauge: Gauge = Gauge.KEEP_FIRST
     subset: SubsetRule = SubsetRule.PAPER
-    # Beyond the paper: see the modules gaussian_head, consistency, gaps, realign and tone.
-    splat_steps: Steps = 0  # steps of the Gaussian head alone on the captured photos, after Algorithm 1; 0: none
-    splat_learning_rate: LearningRate = 3e-3
-    splat_others: Weight = 0.5  # weight of the same photos without the view's own Gaussians
+    # Beyond the paper, but inside the loop; what is done around it has a section of its own (`CorrectionsConfig`).
     # weight of opacities and sizes of Gaussians among the anchors, which the paper's losses never see; 0: they are not made
     alpha_gaussian: Weight = 0.0
-    inserted_weights: InsertedWeights = InsertedWeights.UNIFORM
+    inserted_weights: InsertedWeights = InsertedWeights.UNIFORM  # see the module pixel_weights
     spend: Spend = Spend.ALWAYS
     # with spend=where_moved: least mean change of the captured views' log depth by the insertion that is worth the steps
     spend_above: Annotated[float, Range(0, 10)] = 0.002
-    realign: Realign = Realign.NONE
-    # bring the inserted picture to the photos' exposure and white balance, see `sceneexpander.adaptation.tone`
-    tone: bool = False
-    trust: bool = False  # generated Gaussians fade where captured views contradict them, see `consistency.trusted`
-    # reach of generated Gaussians of new space, in distances between neighbours, see `gaps.closed`; 0: as made
-    close_gaps: Annotated[float, Range(0, 100)] = 0.0
     warp_targets: bool = False  # move the anchors of a warped view with its pixels
     precision: Precision = Precision.FP32
     checkpoint_every: Steps = 25  # steps between resume points; 0: none

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from sceneexpander.adaptation.config import AdaptConfig, InsertedWeights
-from sceneexpander.adaptation.consistency import inserted_weights
 from sceneexpander.adaptation.engine import autocast, set_up
 from sceneexpander.adaptation.inputs import StepViews, geometry_of, heads_of
 from sceneexpander.adaptation.ledger import WeightLedger, teacher_of
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import StepLosses, anchor_targets, step_losses
+from sceneexpander.adaptation.pixel_weights import inserted_weights
 from sceneexpander.adaptation.sampling import Batch
 from sceneexpander.models.protocol import Reconstructor, as_module
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from sceneexpander.adaptation import plateau
 from sceneexpander.adaptation.checkpoint import Checkpoint
 from sceneexpander.adaptation.config import AdaptConfig, DriftForm
-from sceneexpander.adaptation.corrections import Corrections
 from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, geometry_of, heads_of, run_key
 from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.losses import ViewGeometry
@@ -60,7 +59,6 @@ class AdaptationResult:
     looks: tuple[Look, ...]
     steps_saved: int  # by stopping early
     seconds: float
-    corrections: Corrections | None = None  # of what was adapted to; None: whoever called knows
 
 
 def adapt(

@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from jaxtyping import Float
+from torch import Tensor
+
 from sceneexpander.artifacts.store import FACTS_NAME, load_artifact, read_typed, refusing, save_artifact
 from sceneexpander.artifacts.views import ViewSet
 
 SCHEMA = "inserted/1"
+_NOTABLE_ZOOM, _NOTABLE_STRETCH = 0.05, 0.02  # smaller ones are within what registration can tell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,10 +78,55 @@ class CandidateScore:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MisalignmentReport:
+    """How an inserted picture goes with the scene it was made for, posed against it. Without a camera all but the first two is None.
+
+    Attributes:
+        inliers: matched points of the scene that agree with one camera.
+        matches: matched points in all.
+        reprojection_px: median distance of the inliers from where that camera puts them, in stored pixels.
+        world_from_cam: (4, 4), in the frame of the scene before the round.
+        focal_factor: its focal length, relative to the photos' typical one: above 1 it is drawn larger. 1 where that explains it.
+        stretch: how much wider it is drawn at the same height, as a share; 0 where none is told; None, too, with few points.
+        gains: RGB; what the scene's colours are multiplied by to have the picture's tone.
+        supported: share of the picture where the scene from there shows the same.
+        contradicted: share where it shows something else.
+        new: share that no view so far has seen.
+    """
+
+    inliers: int
+    matches: int
+    reprojection_px: float | None = None
+    world_from_cam: tuple[tuple[float, ...], ...] | None = None
+    focal_factor: float | None = None
+    stretch: float | None = None
+    gains: tuple[float, ...] | None = None
+    supported: float | None = None
+    contradicted: float | None = None
+    new: float | None = None
+
+    @property
+    def words(self) -> str:
+        """The same in a sentence."""
+        if self.contradicted is None or self.supported is None or self.new is None or self.focal_factor is None:
+            return f"its camera is not found among the photos ({self.inliers} of {self.matches} matches agree)"
+        said = [
+            f"{self.supported:.0%} of it agrees with the photos, {self.contradicted:.0%} contradicts them, {self.new:.0%} is new",
+            f"{self.inliers} of {self.matches} matches agree with one camera, off by {self.reprojection_px:.1f} px",
+        ]
+        if abs(self.focal_factor - 1) >= _NOTABLE_ZOOM:
+            said.append(f"drawn {abs(self.focal_factor - 1):.0%} {'larger' if self.focal_factor > 1 else 'smaller'}")
+        if self.stretch is not None and abs(self.stretch) >= _NOTABLE_STRETCH:
+            said.append(f"{abs(self.stretch):.0%} too {'wide' if self.stretch > 0 else 'narrow'}")
+        return "; ".join(said)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InsertedView:
     """The chosen candidate fitted to the captured views' size; all candidates' provenance in order.
 
-    ``ranking`` says how they compare and why the chosen one was taken; empty where there was nothing to choose.
+    ``ranking`` says how they compare and why the chosen one was taken; empty where there was nothing to choose. ``misalignment`` and
+    ``support`` (per pixel: 1, or 0 where the scene shows something else) say how it goes with the scene; None: not looked at, or no camera.
     """
 
     round: int
@@ -85,6 +134,8 @@ class InsertedView:
     chosen: int
     provenance: tuple[Provenance, ...]
     ranking: tuple[CandidateScore, ...] = ()
+    misalignment: MisalignmentReport | None = None
+    support: Float[Tensor, "height width"] | None = None
 
     def __post_init__(self) -> None:
         if len(self.view) != 1:
@@ -100,13 +151,14 @@ class InsertedView:
             "chosen": self.chosen,
             "provenance": self.provenance,
             "ranking": self.ranking,
+            "misalignment": self.misalignment,
         }
-        save_artifact(folder, SCHEMA, facts, {})
+        save_artifact(folder, SCHEMA, facts, {} if self.support is None else {"support": self.support})
 
     @classmethod
     def load(cls, folder: Path) -> InsertedView:
         """Read what `save` wrote. Raises `ArtifactError` if it is missing or damaged."""
-        facts, _ = load_artifact(folder, SCHEMA)
+        facts, tensors = load_artifact(folder, SCHEMA)
         read = read_typed(_Facts, facts, folder / FACTS_NAME)
         with refusing(folder):
             return cls(
@@ -115,6 +167,8 @@ class InsertedView:
                 chosen=read.chosen,
                 provenance=read.provenance,
                 ranking=read.ranking,
+                misalignment=read.misalignment,
+                support=tensors.get("support"),
             )
 
 
@@ -126,3 +180,4 @@ class _Facts:
     chosen: int
     provenance: tuple[Provenance, ...]
     ranking: tuple[CandidateScore, ...] = ()
+    misalignment: MisalignmentReport | None = None

@@ -17,7 +17,7 @@ UNAVAILABLE_SCHEMA = "metrics-unavailable/1"
 class Fit(StrEnum):
     """What was done to a reconstruction's Gaussians after they were predicted: only rows with the same can be compared.
 
-    ``FITTED``: fitted for seconds to the pictures that they were made from (`sceneexpander.optimisation.refine`). ``OPTIMISED``: the
+    ``FITTED``: fitted for seconds to the pictures that they were made from (`sceneexpander.photometric.refine`). ``OPTIMISED``: the
     same for minutes and with densification (`sceneexpander.optimisation.optimise`).
     """
 

@@ -220,6 +220,7 @@ class RoundPage:
         inserted_id: its view.
         viewer: the page to walk through.
         sheet: contact sheet of the candidates.
+        overlay: how the inserted view goes with the scene, as a picture; misalignment: the same in words.
         methods: that could be run.
         unavailable: that could not.
         steps: of the adaptation.
@@ -246,6 +247,8 @@ class RoundPage:
     inserted_id: str
     viewer: str
     sheet: str | None
+    overlay: str | None = None
+    misalignment: str | None = None
     methods: tuple[MethodPage, ...]
     unavailable: tuple[MissingMethod, ...]
     steps: Steps
@@ -302,7 +305,7 @@ class ScenePage:
         yield from (photo.picture for photo in self.captured)
         for item in self.rounds:
             yield from (item.inserted, item.viewer)
-            yield from (place for place in (item.sheet, item.problems) if place is not None)
+            yield from (place for place in (item.sheet, item.overlay, item.problems) if place is not None)
             yield from (missing.metrics for missing in item.unavailable)
             yield from (place for look in (item.looks.looks if item.looks else ()) for place in look.pictures.values())
             for method in item.methods:

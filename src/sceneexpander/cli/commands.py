@@ -28,6 +28,9 @@ COMMANDS = (
     Command("plan", "sceneexpander.plan", "tell memory and operations in advance, without a GPU or weights"),
     Command("judge", "sceneexpander.judge_run", "have a vision-language model judge finished scenes"),
     Command("view", "sceneexpander.viewer.__main__", "walk through a reconstructed scene in the browser"),
+    Command(
+        "study", "sceneexpander.study.__main__", "let people rank videos of methods blindly, and compute what they said"
+    ),
     Command("export", "sceneexpander.export", "write a finished scene as PLY, SPZ, GLB, mesh, COLMAP, nerfstudio, ..."),
     Command("ui", "sceneexpander.ui", "open all recorded runs in the browser, running ones live"),
     Command("follow", "sceneexpander.follow", "mirror running adaptations into MLflow without the browser"),

@@ -10,7 +10,7 @@ from typing import Any
 from yaml import YAMLError
 
 from sceneexpander.artifacts.store import to_plain
-from sceneexpander.config.overrides import MAX_OVERRIDE, environment_hidden
+from sceneexpander.config.overrides import MAX_OVERRIDE, environment_hidden, key_of
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import did_you_mean
@@ -20,7 +20,24 @@ FORBIDDEN_KEYS = frozenset({"size", "nfiles"})  # the pipeline's cache key leave
 DEFAULT_SCENE = "default"
 MAX_KEY = 200  # characters
 _ROOT = "config"
-_RENAMED = {"generator.candidate": "choose.candidate", "generator.fit": "choose.fit"}
+_ROWS, _NO_ROW = "ablation", "default"  # the group of rows, and its option that changes nothing
+_RENAMED = {
+    "generator.candidate": "choose.candidate",
+    "generator.fit": "choose.fit",
+    "adapt.realign": "corrections.camera.realign",
+    "adapt.tone": "corrections.colour.match",
+    "adapt.trust": "corrections.contradiction.fade",
+    "adapt.close_gaps": "corrections.gaps.reach",
+    "adapt.splat_steps": "corrections.head.steps",
+    "adapt.splat_learning_rate": "corrections.head.learning_rate",
+    "adapt.splat_others": "corrections.head.others_weight",
+}
+_RENAMED_OPTIONS = {
+    ("ablation", "none"): "default",
+    ("ablation", "full"): "paper",
+    ("ablation", "control_no_adaptation"): "corrected",
+    ("method", "default"): "extended",
+}
 
 
 def scene_option(conf: Path, scene: str) -> str:
@@ -52,8 +69,13 @@ def compose(conf: Path, overrides: Sequence[str]) -> dict[str, Any]:
     with environment_hidden(), _initialised(conf):
         try:
             kept = [text for text in overrides if check_override(conf, text)]
-            composed = hydra_compose(config_name=_ROOT, overrides=kept)
-            plain = OmegaConf.to_container(composed, resolve=True)
+            plain = OmegaConf.to_container(hydra_compose(config_name=_ROOT, overrides=kept), resolve=True)
+            rest = [text for text in kept if key_of(text) != _ROWS]
+            others = (
+                plain
+                if len(rest) == len(kept)
+                else OmegaConf.to_container(hydra_compose(config_name=_ROOT, overrides=rest), resolve=True)
+            )
         except RecursionError:
             raise ConfigError("is nested too deeply", where=conf) from None
         # Hydra lets errors of its own making through for values that it did not expect.
@@ -69,6 +91,12 @@ def compose(conf: Path, overrides: Sequence[str]) -> dict[str, Any]:
             raise explain(error, conf, overrides) from None
     if not isinstance(plain, dict):
         raise ConfigError("composes to no sections", where=conf / "config.yaml")
+    rows = [text for text in kept if text not in rest]
+    if rows and plain == others and rows[-1].partition("=")[2].strip("'\"") != _NO_ROW:
+        # What a row leaves out may not be there: its results would be those of the default under another name.
+        raise ConfigError(
+            "changes nothing of these settings", where=rows[-1], fix="leave it out, or choose another method="
+        )
     values = {str(key): value for key, value in plain.items()}
     refuse_forbidden_keys(values)
     return to_plain(parse_dataclass(ProjectConfig, values))
@@ -115,6 +143,9 @@ def check_override(conf: Path, text: str) -> bool:
     if not isinstance(value, str) or value not in options:
         # As it was written: what Hydra reads may be a list or a number.
         written = text.partition("=")[2]
+        if (group, written) in _RENAMED_OPTIONS:
+            fix = f"write {group}={_RENAMED_OPTIONS[group, written]}"
+            raise ConfigError(f"option {written!r} has another name now", where=group, fix=fix)
         raise ConfigError(
             f"has no option {shorten(written)!r}", where=group, fix=did_you_mean(shorten(written), options)
         )

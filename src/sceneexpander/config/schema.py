@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from sceneexpander.adaptation.config import AdaptConfig
-from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.generation import ChoiceConfig, GeneratorConfig
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import IngestConfig
+from sceneexpander.insertion.config import CorrectionsConfig
 from sceneexpander.judge.config import JudgeConfig
-from sceneexpander.optimisation.config import OptimiseConfig, RefineConfig
+from sceneexpander.optimisation.config import OptimiseConfig
+from sceneexpander.photometric.config import RefineConfig, WarmupConfig
 from sceneexpander.ranges import Range, check_ranges
 from sceneexpander.reconstruction.loaded import ModelConfig
 from sceneexpander.rendering import RenderConfig
@@ -39,6 +40,7 @@ class ProjectConfig:
     frontend: FrontendConfig
     warmup: WarmupConfig
     adapt: AdaptConfig
+    corrections: CorrectionsConfig
     refine: RefineConfig
     rivals: RivalsConfig
     optimise: OptimiseConfig

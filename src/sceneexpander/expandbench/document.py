@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed, to_plain, write_json_atomic
 from sceneexpander.catalogue import Metric, Views, metric_named
 from sceneexpander.catalogue.metrics import metrics_named
@@ -25,9 +24,10 @@ from sceneexpander.expandbench.table import (
     paired_table,
     scenes_table,
 )
+from sceneexpander.expansion import MethodConfig
 
 SCHEMA = "ablation/3"
-DEFAULT, CORRECTED = "none", "corrected"
+DEFAULT, PAPER, CORRECTED = "default", "paper", "corrected"
 READING = "<!-- Above: written by the command. Below: written by hand, without numbers. -->"
 _SHORT = metrics_named(
     "psnr_at_photo_size_db", "psnr_from_others_db", "psnr_inserted_db", "psnr_new_region_db", "psnr_half_way_db"
@@ -39,7 +39,7 @@ class Measured:
     """A study as it was measured."""
 
     cells: tuple[CellResult, ...]
-    rows: Mapping[str, AdaptConfig]
+    rows: Mapping[str, MethodConfig]
     visits: int  # of the fit, per view; 0: Gaussians as predicted
 
     def to_plain(self) -> dict[str, Any]:
@@ -74,7 +74,7 @@ class Results:
             name: Measured(
                 cells=tuple(CellResult.from_plain(cell) for cell in study["cells"]),
                 rows={
-                    row: read_typed(AdaptConfig, values, path, fix="make ablation")
+                    row: read_typed(MethodConfig, values, path, fix="make ablation")
                     for row, values in study["rows"].items()
                 },
                 visits=study["visits"],
@@ -125,15 +125,15 @@ Prepared scenes stay there for the four codes and configurations used last.
 make ablation                                              # all studies below; the better part of a day on two cores
 make ablation ARGS="--study rows,long"                     # some of them
 make ablation ARGS="--finished"                            # nothing is run: the page from the cells that are there
-make ablation ARGS="--rows full,none --grades mixed_2 --seeds 0"   # a table of your own, this page is left alone
-sceneexpander sweep --multirun ablation=baseline,full,none seed=0,1,2    # rows as whole pipelines
-python scripts/real_ablation.py FOLDER ... --rows full,none                        # on scene folders without truth
+make ablation ARGS="--rows paper,default --grades mixed_2 --seeds 0"   # a table of your own, this page is left alone
+sceneexpander sweep --multirun ablation=baseline,paper,default seed=0,1,2    # rows as whole pipelines
+python scripts/real_ablation.py FOLDER ... --rows paper,default                        # on scene folders without truth
 ```
 
 *What rows hold.* `captured`: the scene before the insertion. `baseline`: the same weights given the inserted view like a photo.
 `corrected`: what SceneExpander changes without a step of adaptation (the inserted picture's colours, cameras, fading, closed gaps, a
-doubting fit). `none`: the default, the same with Algorithm 1 (nothing left out). `full`: the paper's method, Algorithm 1 without the
-corrections; the rows before it in the paper's table have fewer of its components. `no_...`: the default without one correction.
+doubting fit). `default`: the same with Algorithm 1, nothing left out. `paper`: the paper's method, Algorithm 1 without the corrections;
+the rows before it in the paper's table have fewer of its components. `no_...`: the default without one correction.
 `control_...`: see `conf/ablation/`.
 
 *How they are compared.* Rows of one scene, grade and seed differ in nothing but the row: the same estimate of the front-end, the same seed
@@ -162,17 +162,17 @@ def _kinds(scenes: Sequence[str]) -> dict[str, int]:
     return {kind: count for kind, count in found.items() if count}
 
 
-def _steps(rows: Mapping[str, AdaptConfig]) -> str:
-    settings = {(row.steps, row.learning_rate) for row in rows.values() if row.steps}
+def _steps(rows: Mapping[str, MethodConfig]) -> str:
+    settings = {(row.adapt.steps, row.adapt.learning_rate) for row in rows.values() if row.adapt.steps}
     return "".join(f"; {steps} steps at {rate:g}" for steps, rate in sorted(settings))
 
 
-def references_of(rows: Mapping[str, AdaptConfig]) -> dict[str, str]:
+def references_of(rows: Mapping[str, MethodConfig]) -> dict[str, str]:
     """What each row is compared with, see `REFERENCES`: the default, where nothing else is said."""
     return {row: reference for row in rows if (reference := REFERENCES.get(row, DEFAULT)) in {BASELINE, *rows}}
 
 
-def powerless(rows: Mapping[str, AdaptConfig]) -> dict[str, str]:
+def powerless(rows: Mapping[str, MethodConfig]) -> dict[str, str]:
     """Rows that cannot differ from what they are compared with, and why."""
     pairs = {row: reference for row, reference in references_of(rows).items() if reference != BASELINE}
     return {
@@ -192,7 +192,7 @@ def _sections(study: Study, measured: Measured) -> list[str]:
         ]
         picture = "![captured PSNR against misalignment](ablation.svg)"
         return [*curves, picture, "### Judging candidates before inserting them\n\n" + acceptance_table(cells)]
-    names = [row for row in ("full", CORRECTED, DEFAULT) if row in rows]
+    names = [row for row in (PAPER, CORRECTED, DEFAULT) if row in rows]
     return [
         "### Differences to the baseline\n\n" + paired_table(cells),
         "### Component by component\n\n" + components_table(cells, references_of(rows), powerless(rows), _SHORT),
@@ -220,7 +220,7 @@ def _in_short(results: Results) -> list[str]:
             ("The default against the unadapted model", DEFAULT, BASELINE),
             ("The corrections alone against the unadapted model", CORRECTED, BASELINE),
             ("Algorithm 1 on top of the corrections", DEFAULT, CORRECTED),
-            ("The paper's method without corrections against the unadapted model", "full", BASELINE),
+            ("The paper's method without corrections against the unadapted model", PAPER, BASELINE),
         ):
             texts = [
                 text

@@ -8,6 +8,8 @@ Axes:
 - ``told_rotation_N``, ``told_translation_N``: the same picture, but the reconstructor is told the *intended* camera, as when the motion was
   asked for in words and taken at its word. Only these two make a pose shift an inconsistency.
 - ``warp_N``: smooth local warps whose largest displacement is N % of the image width.
+- ``stretch_N``, ``zoom_N``, ``shift_N``: what image editors do to the whole picture: it is N % wider at the same height, drawn N %
+  larger about its middle, or moved by N % of its width in a random direction.
 - ``deform_N``: objects moved by up to N % of the scene size and changed in size by up to twice that.
 - ``hallucinate``: an object that is neither in the scene nor asked for.
 - ``exposure_N``: N tenths of a stop brighter, with a fifth of that as colour cast.
@@ -72,6 +74,15 @@ def _all() -> dict[str, Grade]:
         )
         mixed = Misalignment.graded(amount)
         grades.append(Grade(name=f"mixed_{amount}", axis="mixed", amount=amount, misalignment=mixed))
+    for amount in (4, 8):
+        stretched = Misalignment(stretch=amount / 100)
+        grades.append(Grade(name=f"stretch_{amount}", axis="stretch", amount=amount, misalignment=stretched))
+    for amount in (5, 10, 20):
+        zoomed = Misalignment(zoom=amount / 100)
+        grades.append(Grade(name=f"zoom_{amount}", axis="zoom", amount=amount, misalignment=zoomed))
+    for amount in (2, 5):
+        displaced = Misalignment(shift_fraction=amount / 100)
+        grades.append(Grade(name=f"shift_{amount}", axis="shift", amount=amount, misalignment=displaced))
     grades.append(Grade(name="hallucinate", axis="hallucinate", amount=1, misalignment=Misalignment(hallucinate=True)))
     for amount in (3, 6):
         brighter = Misalignment(exposure_stops=amount / 10, white_balance=amount / 50)

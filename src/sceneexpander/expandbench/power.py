@@ -9,17 +9,21 @@ from __future__ import annotations
 from dataclasses import fields
 
 from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.expansion import MethodConfig
 
 LEAST_TOUCHED = 0.03  # share of the weights that restoration must touch; the paper's own run touches 3.9 %
 
 
-def without_power(row: AdaptConfig, reference: AdaptConfig) -> str | None:
+def without_power(method: MethodConfig, compared: MethodConfig) -> str | None:
     """Why a row cannot differ from its reference in its number of steps; None if it can.
 
     Args:
-        row: a configuration of the ablation.
-        reference: what it is compared with.
+        method: a row of the ablation.
+        compared: what it is compared with.
     """
+    if method.corrections != compared.corrections:
+        return None  # they act whatever the steps
+    row, reference = method.adapt, compared.adapt
     differing = {f.name for f in fields(AdaptConfig) if getattr(row, f.name) != getattr(reference, f.name)}
     reasons = []
     for names, reason in (

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.reconstruction import Reconstruction
@@ -24,6 +23,7 @@ from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.gauge import in_gauge_of
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.similarity import Similarity, align_views
+from sceneexpander.photometric.config import WarmupConfig
 from sceneexpander.reconstruction.views import reconstruct, views_priors
 
 SEED = 0  # of the front-end and the warm-up: the same estimate for every row and seed
@@ -40,7 +40,7 @@ class PreparedScene:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreparedCase:
-    """A scene with a view inserted: what `adapt_round` starts from, the baseline as predicted, and the truth about all views."""
+    """A scene with a view inserted: what a round starts from, the baseline as predicted, and the truth about all views."""
 
     inputs: RoundInputs
     backbone: Reconstruction

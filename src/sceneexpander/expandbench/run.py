@@ -15,20 +15,27 @@ from pathlib import Path
 
 import torch
 
-from sceneexpander.adaptation.acceptance import Acceptance
-from sceneexpander.adaptation.config import AdaptConfig
-from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.state import WeightsChange
 from sceneexpander.artifacts.store import keep_newest, read_json, to_plain, write_json_atomic
 from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.measure import BenchNumbers, measure
 from sceneexpander.expandbench.prepared import PreparedCase, PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.scenes import BenchScene, build_scene
-from sceneexpander.expansion import LoadedModel, ModelConfig, judge_round, load_model, refined, refined_round
-from sceneexpander.expansion.rounds import RoundInputs, adapted_weights, aligned, finished_round
+from sceneexpander.expansion import (
+    Adapted,
+    LoadedModel,
+    MethodConfig,
+    ModelConfig,
+    Procedure,
+    Watch,
+    compose_procedure,
+    judge_round,
+    load_model,
+)
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.insertion.acceptance import Acceptance
+from sceneexpander.photometric.config import RefineConfig, WarmupConfig
+from sceneexpander.photometric.fitting import fit_to_views
 from sceneexpander.reconstruction.views import reconstruct
 
 CAPTURED = "captured"  # the pre-insertion scene
@@ -62,7 +69,7 @@ class Plan:
 
     scenes: tuple[str, ...]
     grades: tuple[str, ...]
-    rows: Mapping[str, AdaptConfig]
+    rows: Mapping[str, MethodConfig]
     seeds: tuple[int, ...]
 
     def __len__(self) -> int:
@@ -151,9 +158,9 @@ class _Worker:
         self._loaded: LoadedModel | None = None
         self._prepared: PreparedScene | None = None
         self._cases: dict[str, PreparedCase] = {}
-        self._last: tuple[tuple[str, AdaptConfig, int], tuple[RoundInputs, WeightsChange, float, int]] | None = None
+        self._last: tuple[tuple[str, Procedure, int], tuple[Adapted, float]] | None = None
 
-    def cell(self, grade: str, row: str, seed: int, config: AdaptConfig | None) -> CellResult | None:
+    def cell(self, grade: str, row: str, seed: int, config: MethodConfig | None) -> CellResult | None:
         """The cell's result, kept or new; None if it is not there and nothing is to be run."""
         identity = {
             "schema": CELL_SCHEMA,
@@ -181,7 +188,7 @@ class _Worker:
         return result
 
     def _measured(
-        self, grade: str, row: str, seed: int, config: AdaptConfig | None, checkpoints: Path | None = None
+        self, grade: str, row: str, seed: int, config: MethodConfig | None, checkpoints: Path | None = None
     ) -> CellResult:
         torch.set_num_threads(self.settings.threads)
         alone: BenchNumbers | None = None
@@ -189,21 +196,25 @@ class _Worker:
         fit = self.settings.refine
         if row == CAPTURED:
             case, before = None, self.prepared
-            reconstruction, _ = refined(before.captured, before.state.views, fit, doubt_generated=False, seed=seed)
+            reconstruction, _ = fit_to_views(before.captured, before.state.views, fit, seed=seed)
         else:
             case = self.case(grade)
             if config is None:
                 views = case.inputs.state.views.append(case.inputs.inserted.view)
-                reconstruction, _ = refined(case.backbone, views, fit, doubt_generated=False, seed=seed)
+                reconstruction, _ = fit_to_views(case.backbone, views, fit, seed=seed)
             else:
-                inputs, weights, seconds, steps = self._adapted(grade, case, config, seed, checkpoints)
+                procedure = compose_procedure(config, fit)
+                adapted, seconds = self._adapted(
+                    grade, case, procedure, seed, checkpoints if config.adapt.checkpoint_every else None
+                )
+                steps = len(adapted.result.records)
                 started = time.perf_counter()
-                state, reconstruction = finished_round(inputs, weights, self.loaded, config, seed=seed)
-                reconstruction, _ = refined_round(reconstruction, state, config, fit, seed=seed)
+                expanded = procedure.finish(adapted, self.loaded, seed=seed)
+                reconstruction = expanded.scene
                 seconds += time.perf_counter() - started
-                start = inputs.state
-                without = reconstruct(start.views, start.priors, self.loaded, state.weights, method="alone")
-                without, _ = refined(without, start.views, fit, doubt_generated=False, seed=seed)
+                start = adapted.inputs.state
+                without = reconstruct(start.views, start.priors, self.loaded, expanded.state.weights, method="alone")
+                without, _ = fit_to_views(without, start.views, fit, seed=seed)
                 alone = self._numbers(without, None)
         return CellResult(
             scene=self.name,
@@ -219,22 +230,15 @@ class _Worker:
         )
 
     def _adapted(
-        self, grade: str, case: PreparedCase, config: AdaptConfig, seed: int, checkpoints: Path | None
-    ) -> tuple[RoundInputs, WeightsChange, float, int]:
-        """(aligned inputs, weights, seconds, steps) of Algorithm 1 alone: rows that differ in what follows share it. The last is kept."""
-        shared = replace(config, trust=False, close_gaps=0.0, splat_steps=0)
-        key = grade, shared, seed
+        self, grade: str, case: PreparedCase, procedure: Procedure, seed: int, checkpoints: Path | None
+    ) -> tuple[Adapted, float]:
+        """(the round after Algorithm 1, seconds): rows that differ in what follows share it. The last is kept."""
+        key = grade, replace(procedure, weights=(), after=()), seed
         if self._last is None or self._last[0] != key:
             started = time.perf_counter()
-            inputs = aligned(case.inputs, self.loaded, config, seed=seed)
-            weights, result = adapted_weights(
-                inputs,
-                self.loaded,
-                config,
-                seed=seed,
-                checkpoint_folder=checkpoints if config.checkpoint_every else None,
-            )
-            self._last = key, (inputs, weights, time.perf_counter() - started, len(result.records))
+            watch = Watch(checkpoint_folder=checkpoints)
+            adapted = procedure.adapt(case.inputs, self.loaded, seed=seed, watch=watch)
+            self._last = key, (adapted, time.perf_counter() - started)
         return self._last[1]
 
     def _numbers(self, reconstruction: Reconstruction, case: PreparedCase | None) -> BenchNumbers:
@@ -275,7 +279,7 @@ class _Worker:
 
 def _scene_cells(name: str, plan: Plan, settings: Settings) -> Iterator[CellResult]:
     worker = _Worker(name, settings)
-    wanted: list[tuple[str, str, int, AdaptConfig | None]] = [("", CAPTURED, seed, None) for seed in plan.seeds]
+    wanted: list[tuple[str, str, int, MethodConfig | None]] = [("", CAPTURED, seed, None) for seed in plan.seeds]
     for grade in plan.grades:
         wanted += [(grade, BASELINE, seed, None) for seed in plan.seeds]
         wanted += [(grade, row, seed, config) for row, config in plan.rows.items() for seed in plan.seeds]

@@ -21,7 +21,7 @@ from sceneexpander.artifacts.views import ViewRecord, ViewSet, to_uint8
 from sceneexpander.evaluation.truth import SceneTruth, ViewTruth
 from sceneexpander.synthetic.bundled import unseen_by
 from sceneexpander.synthetic.degrade import auto_exposure, encode_radiance
-from sceneexpander.synthetic.misalign import Misalignment, misalign
+from sceneexpander.synthetic.misalign import MisalignedView, Misalignment, misalign
 from sceneexpander.synthetic.render import render_world, trace_camera
 from sceneexpander.synthetic.scenes import build_world
 from sceneexpander.synthetic.trajectories import pose_from_angles
@@ -102,17 +102,21 @@ class BenchScene:
         """Of the captured views."""
         return SceneTruth(views=self.captured_truth)
 
+    def draw(self, misalignment: Misalignment, *, seed: int = 0) -> MisalignedView:
+        """The inserted picture, in detail pixels, as a generator with these errors draws it, with the record of what is wrong where."""
+        digest = hashlib.sha256(f"{self.name}:{seed}".encode()).digest()
+        generator = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+        return misalign(
+            self.world, self.cameras[-1], self.intrinsics_px, HEIGHT * DETAIL, WIDTH * DETAIL, misalignment, generator,
+            exposure=self.exposure, supersample=1.0,
+        )  # fmt: skip
+
     def insert(self, misalignment: Misalignment, *, seed: int = 0) -> tuple[ViewSet, SceneTruth]:
         """(the inserted view as a generator with these errors draws it, truth of all views).
 
         The truth of the inserted view is that of the *intended* view.
         """
-        digest = hashlib.sha256(f"{self.name}:{seed}".encode()).digest()
-        generator = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        drawn = misalign(
-            self.world, self.cameras[-1], self.intrinsics_px, HEIGHT * DETAIL, WIDTH * DETAIL, misalignment, generator,
-            exposure=self.exposure, supersample=1.0,
-        )  # fmt: skip
+        drawn = self.draw(misalignment, seed=seed)
         view = _view_set([_picture(drawn.image)], ["inserted"], generated=True)
         truth = ViewTruth(
             world_from_cam=self.intended.world_from_cam.double(),

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from sceneexpander.expandbench.run import BASELINE
 from sceneexpander.expandbench.scenes import DEVELOPMENT, TEST
 
-TABLE = ("anchor", "subset_aug", "self_distill", "self_distill_p1", "full")  # the paper's, after the baseline
+TABLE = ("anchor", "subset_aug", "self_distill", "self_distill_p1", "paper")  # the paper's, after the baseline
 BEYOND = (
     "no_realign",
     "no_tone",
     "no_trust",
     "no_close_gaps",
     "corrected",
-    "none",
-)  # "none": nothing left out of the default
+    "default",
+)
 CONTROLS = ("control_no_insertion", "control_no_anchor")
 
 # What every row is compared with to see one component's own effect; rows that are not named: with the default.
@@ -24,11 +24,12 @@ REFERENCES = {
     "subset_aug": "anchor",
     "self_distill": "subset_aug",
     "self_distill_p1": "self_distill",
-    "full": "self_distill",
-    "control_no_insertion": "full",
-    "control_no_anchor": "full",
+    "paper": "self_distill",
+    "control_no_insertion": "paper",
+    "control_no_anchor": "paper",
     "corrected": BASELINE,
-    "none": "corrected",
+    "default": "corrected",
+    "gaussian_anchors": "spend_always",
 }
 
 
@@ -68,10 +69,10 @@ STUDIES = (
     Study(
         name="predicted",
         title="The rows, as the network makes them",
-        meaning="Without the fit, as in the paper, whose methods are feed-forward.",
+        meaning="Without the fit, as in the paper, whose methods are feed-forward: here the row `paper` is `method=paper`.",
         scenes=DEVELOPMENT,
         grades=("mixed_2",),
-        rows=(*TABLE, "corrected", "none"),
+        rows=(*TABLE, "corrected", "default"),
         seeds=(0, 1, 2),
         overrides=("refine.visits=0",),
     ),
@@ -90,7 +91,7 @@ STUDIES = (
             "translation_5",
             "translation_10",
         ),
-        rows=("corrected", "none"),
+        rows=("corrected", "default"),
         seeds=(0,),
     ),
     Study(
@@ -101,9 +102,9 @@ STUDIES = (
         grades=("mixed_2",),
         rows=(
             "self_distill",
-            "full",
+            "paper",
             "corrected",
-            "none",
+            "default",
             "ema_momentum_099",
             "restore_interval_1",
             "restore_interval_100",
@@ -113,12 +114,31 @@ STUDIES = (
         experiment="expandbench_long",
     ),
     Study(
+        name="spend",
+        title="When the steps are run, and what they hold",
+        meaning="Every step against steps where the insertion moved something, and with Gaussians among the anchors.",
+        scenes=DEVELOPMENT,
+        grades=("mixed_2",),
+        rows=("spend_always", "gaussian_anchors", "corrected", "default"),
+        seeds=(0,),
+    ),
+    Study(
+        name="free_cameras",
+        title="Where the camera head has its say",
+        meaning="The variant of the model whose camera head counts in full, for all rows, the baseline among them.",
+        scenes=DEVELOPMENT,
+        grades=("mixed_2",),
+        rows=("spend_always", "corrected", "default"),
+        seeds=(0,),
+        overrides=("model.variant=free_cameras",),
+    ),
+    Study(
         name="test",
         title="Test scenes",
         meaning="Scenes that nothing was chosen on, measured once for this version; with the fit.",
         scenes=TEST,
         grades=("clean", "mixed_2"),
-        rows=("full", "corrected", "none"),
+        rows=("paper", "corrected", "default"),
         seeds=(0, 1, 2),
     ),
 )

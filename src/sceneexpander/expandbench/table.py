@@ -6,10 +6,10 @@ import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.catalogue import Metric, Table
 from sceneexpander.catalogue.metrics import DASH, metrics_named
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
+from sceneexpander.insertion.acceptance import Acceptance
 
 COLUMNS = metrics_named(
     "psnr_at_photo_size_db",

@@ -44,8 +44,8 @@ class ViewEvidence:
             pictures alone leave it uncertain; 0 where they are shared or known from elsewhere.
         rival_angle_deg: how far the directions to the others move if it stood where a flat surface would look the same; 0 where relief
             or a third view rules that out.
-        spread_deg: how far the directions to the others move to cameras of another focal, or of another centre for a part cut out of a
-            photo, that explain the photos about as well.
+        spread_deg: how far the directions to the others move to cameras of another focal (of all views or of this one alone), or of another
+            centre for a part cut out of a photo, that explain the photos about as well.
     """
 
     agreeing: float
@@ -72,6 +72,8 @@ class ViewEvidence:
         """Why the camera is only roughly right; empty if there is no such reason."""
         if self.agreeing < config.sure_agreeing:
             return f"only {self.agreeing:.0%} of its matches with other photos agree with its camera"
+        if self.rotation_gap_deg > config.sure_rotation_gap_deg:
+            return f"its turns against other photos, pair by pair, are {self.rotation_gap_deg:.0f} degrees off"
         if self.direction_sigma_deg > config.max_direction_deg:
             return (
                 "the photos were taken from nearly one place: directions between cameras may be off by"

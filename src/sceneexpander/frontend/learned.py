@@ -14,7 +14,6 @@ import functools
 import importlib.util
 import io
 import logging
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,13 +105,6 @@ def shared_descriptors(a: LearnedKeypoints, b: LearnedKeypoints) -> int:
     best, nearest = scores.max(1)
     mutual = scores.argmax(0)[nearest] == torch.arange(len(nearest))
     return int((mutual & (best > _SIMILAR)).sum())
-
-
-def match_pairs(
-    keypoints: Sequence[LearnedKeypoints], pairs: Iterable[tuple[int, int]], config: SfmConfig
-) -> dict[tuple[int, int], Matches]:
-    """`match_learned` for several pairs of views."""
-    return {(a, b): match_learned(keypoints[a], keypoints[b], config) for a, b in pairs}
 
 
 @functools.cache

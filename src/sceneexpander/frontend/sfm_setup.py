@@ -30,6 +30,7 @@ class Setup:
     scale_xy: np.ndarray  # pixels of the given images per pixel of the feature images
     unit_px: float
     seed: int
+    remarks: tuple[str, ...] = ()  # what was noticed of given cameras
     overlay: bool = False  # something is drawn over all pictures; ``shown`` leaves it out
 
     def without(self, spots_xy: np.ndarray) -> Setup:
@@ -152,4 +153,7 @@ def known_cameras(setup: Setup, intrinsics_px: Tensor | None, world_from_cam: Te
             u, _, vt = np.linalg.svd(rotation)  # poses from text files are orthogonal to a few digits only
             cam_from_world[view, :3, :3] = (u @ vt).T
             cam_from_world[view, :3, 3] = -(u @ vt).T @ given[view, :3, 3]
+        if posed.sum() == 1:
+            posed[:] = False  # one pose alone says nothing: the world frame is the first view's anyway
+            cam_from_world[:] = np.eye(4)
     return KnownCameras(intrinsics=intrinsics, cam_from_world=cam_from_world, posed=posed)

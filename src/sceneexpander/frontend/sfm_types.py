@@ -148,6 +148,7 @@ class SfmConfig:
     sure_agreeing: Share = 0.7  # the same for a camera that is not called rough
     # Between the model's relative rotations and those of single pairs, whose planes and few matches make them rough: median over pairs.
     max_rotation_gap_deg: Annotated[float, Range(0, 180)] = 20.0
+    sure_rotation_gap_deg: Annotated[float, Range(0, 180)] = 9.0  # the same for a camera that is not called rough
     # Predicted error of directions (standard deviation, median over the other views): beyond it a camera is rough.
     max_direction_deg: Annotated[float, Range(0, 180)] = 6.0
     # How far directions move to other cameras that explain the photos about as well (another focal, another slope of a flat surface).

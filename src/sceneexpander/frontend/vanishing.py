@@ -1,17 +1,15 @@
-"""What straight lines say about cameras without any match between views: the focal length, and how a view is turned.
+"""What straight lines say about the focal length without any match between views.
 
 Rooms and buildings are full of lines along three orthogonal directions. Where the lines of one direction meet is its vanishing point, and
 three vanishing points of orthogonal directions tie the focal length down. Per view, line segments are found and the box (three
 orthogonal directions) that explains most of their length is searched for at every focal length of a grid; over the views of a set that
-share a focal the shares explained are added up. How a view is turned against the box is known up to the 24 rotations that map a box
-onto itself.
+share a focal the shares explained are added up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations, product
 
 import cv2
 import numpy as np
@@ -30,11 +28,10 @@ _MOST_PIECES, _MOST_SEGMENTS = 800, 250  # the longest are kept, before and afte
 _JOIN_DEG, _JOIN_ACROSS, _JOIN_ALONG = 1.5, 0.002, 0.03  # of the long side, for pieces of one line
 _TOLERANCE_DEG = 2.0  # between a segment and the direction to its vanishing point
 _FINE_DEG = 1.2  # the same after the search
+_SAMPLES = 1000  # triples of segments drawn, before those that name one twice are dropped
 _HYPOTHESES = 250  # per focal length of the grid
-_FRAME_HYPOTHESES = 1000  # at the focal length that is known or was found
 _REFINED = 3  # best hypotheses that are refined
 _MIN_SEGMENTS = 12
-_DISTINCT_DEG, _RIVALS = 12.0, 6
 _BOOTSTRAPS = 100
 _SURE_SIGMA = 0.15  # views whose own focal is less certain do not speak about how far views are apart
 _LEAST_SIGMA = 0.04  # lens distortion, a principal point that is not in the middle
@@ -60,31 +57,6 @@ class Segments:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ManhattanFrame:
-    """Three orthogonal directions of the lines of one view.
-
-    Attributes:
-        cam_from_box: (3, 3) rotation; its columns are the directions in the camera (OpenCV axes). The second is the one nearest to
-            the camera's down; which of the others is called first is arbitrary.
-        score: share of the segments' length that runs along one of the three.
-        confidence: how often this one wins over quite different ones when the segments are drawn again.
-        axis_share: how much of that each direction has.
-        segments: number of segments.
-    """
-
-    cam_from_box: Array
-    score: float
-    confidence: float
-    axis_share: tuple[float, float, float]
-    segments: int
-
-    @property
-    def down(self) -> Array:
-        """(3,) the vertical direction in the camera, pointing down; right for pictures that were not taken on their side."""
-        return self.cam_from_box[:, 1]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FocalEvidence:
     """A focal length that the lines of a set of views agree on.
 
@@ -94,7 +66,6 @@ class FocalEvidence:
         per_view: (focal, sigma) of each view alone; None where there are too few lines.
         focals: the grid.
         curve: (focal,) mean over the views of the share of line length explained.
-        frames: per view at that focal; None where there are too few lines.
     """
 
     focal_ratio: float
@@ -102,7 +73,6 @@ class FocalEvidence:
     per_view: tuple[tuple[float, float] | None, ...]
     focals: Array
     curve: Array
-    frames: tuple[ManhattanFrame | None, ...]
 
 
 def find_segments(image: Float[Tensor, "3 height width"]) -> Segments:
@@ -180,7 +150,7 @@ def _lines(segments: Segments) -> _Lines | None:
     weight = np.minimum(segments.length, 0.3)
     weight = weight / weight.sum()
     rng = np.random.default_rng(0)
-    samples = rng.choice(segments.count, (_FRAME_HYPOTHESES, 3), p=weight)
+    samples = rng.choice(segments.count, (_SAMPLES, 3), p=weight)
     ordered = np.sort(samples, axis=1)
     samples = samples[(ordered[:, 1:] != ordered[:, :-1]).all(1)]
     return _Lines(middle=middle, step=step, line=line, weight=weight, samples=samples)
@@ -230,30 +200,6 @@ def _search(lines: _Lines, focal: float, start: Array | None) -> tuple[Array, fl
     return best, best_score
 
 
-def _rivals(lines: _Lines, focal: float) -> list[Array]:
-    """Good frames that differ by more than a little, refined; the best first."""
-    kept: list[Array] = []
-    for frame in _hypotheses(lines, focal, _FRAME_HYPOTHESES):
-        if all(box_angle_deg(frame, other) > _DISTINCT_DEG for other in kept):
-            kept.append(frame)
-        if len(kept) == _RIVALS:
-            break
-    refined = [_refined(lines, frame, focal) for frame in kept]
-    refined.sort(key=lambda frame: -float(_fit(lines, frame, focal) @ lines.weight))
-    distinct: list[Array] = []
-    for frame in refined:  # refinement may have led two to the same place
-        if all(box_angle_deg(frame, other) > _DISTINCT_DEG / 2 for other in distinct):
-            distinct.append(frame)
-    return distinct
-
-
-def box_angle_deg(frame: Array, other: Array) -> float:
-    """Angle between two frames, whichever axes are called what."""
-    turns = np.einsum("ij,sjk,lk->sil", frame, _BOX, other)
-    cosine = (np.trace(turns, axis1=1, axis2=2).max() - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
 def _refined(lines: _Lines, frame: Array, focal: float) -> Array:
     """Turned a little so that the segments of each direction point at its vanishing point better."""
     limit = np.sin(np.deg2rad(_TOLERANCE_DEG)) ** 2
@@ -278,42 +224,6 @@ def _refined(lines: _Lines, frame: Array, focal: float) -> Array:
         if angle < 1e-5:
             break
     return frame
-
-
-def manhattan_frame(image: Float[Tensor, "3 height width"], focal_ratio: float) -> ManhattanFrame | None:
-    """The three orthogonal directions that most lines of a picture run along; None with too few lines.
-
-    Args:
-        image: RGB in [0, 1].
-        focal_ratio: focal length over the long side; the principal point is the middle.
-    """
-    lines = _lines(find_segments(image))
-    return None if lines is None else _frame(lines, focal_ratio)
-
-
-def _frame(lines: _Lines, focal: float) -> ManhattanFrame:
-    """The best of several rivals, its axes in order, and how sure it is."""
-    rivals = _rivals(lines, focal)
-    best = rivals[0]
-    fit = np.stack([_fit(lines, frame, focal) for frame in rivals])
-    weight = lines.weight * np.random.default_rng(0).poisson(1.0, (_BOOTSTRAPS, len(lines.weight)))
-    confidence = float(((weight @ fit.T).argmax(1) == 0).mean())
-    down = int(np.abs(best[1]).argmax())
-    others = [k for k in range(3) if k != down]
-    ordered = best[:, [others[0], down, others[1]]]
-    ordered = ordered * np.where(ordered[1, 1] < 0, -1, 1)
-    if np.linalg.det(ordered) < 0:
-        ordered[:, 0] *= -1
-    off = _off(lines, ordered.T, focal)
-    explained = off.min(0) < np.sin(np.deg2rad(_TOLERANCE_DEG)) ** 2
-    shares = [float(lines.weight[explained & (off.argmin(0) == k)].sum()) for k in range(3)]
-    return ManhattanFrame(
-        cam_from_box=ordered,
-        score=float(fit[0] @ lines.weight),
-        confidence=confidence,
-        axis_share=(shares[0], shares[1], shares[2]),
-        segments=len(lines.weight),
-    )
 
 
 def _fit(lines: _Lines, frame: Array, focal: float) -> Array:
@@ -359,7 +269,6 @@ def vanishing_focal(images: Sequence[Tensor] | Tensor) -> FocalEvidence | None:
         per_view=tuple(alone),
         focals=focals,
         curve=curve,
-        frames=tuple(None if view is None else _frame(view, middle) for view in lines),
     )
 
 
@@ -404,17 +313,3 @@ class _Grid:
         """(draw, focal): the curve when the segments are drawn again."""
         weight = self.weight * np.random.default_rng(0).poisson(1.0, (_BOOTSTRAPS, len(self.weight)))
         return (weight / np.maximum(weight.sum(1, keepdims=True), 1e-9)) @ self.share.T
-
-
-def box_rotations() -> Array:
-    """(24, 3, 3): the rotations that map a box onto itself."""
-    found = []
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        matrix = np.zeros((3, 3))
-        matrix[range(3), order] = signs
-        if np.linalg.det(matrix) > 0:
-            found.append(matrix)
-    return np.stack(found)
-
-
-_BOX = box_rotations()

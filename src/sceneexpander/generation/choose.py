@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jaxtyping import Float
 from torch import Tensor
@@ -17,6 +17,7 @@ from sceneexpander.generation.assess import Assessed, assess
 from sceneexpander.generation.backends import make_generator
 from sceneexpander.generation.backends.stored import own_picture
 from sceneexpander.generation.config import AUTO, ChoiceConfig, GeneratorConfig
+from sceneexpander.generation.misalignment import report_misalignment
 from sceneexpander.generation.opinion import judge_candidates
 from sceneexpander.generation.protocol import Forecast, GenerationContext, SceneSoFar
 from sceneexpander.generation.rank import rank_candidates
@@ -29,10 +30,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChosenView:
-    """The inserted view, and all candidates on one picture to choose by eye."""
+    """The inserted view, all candidates on one picture to choose by eye, and where the chosen one contradicts the scene (`Misaligned`)."""
 
     inserted: InsertedView
     sheet: Float[Tensor, "3 height width"]
+    overlay: Float[Tensor, "3 height width3"] | None
 
 
 def choose_view(
@@ -54,14 +56,19 @@ def choose_view(
     assessed = [assess(item, so_far.views, choice.fit) for item in _with_own(context, candidates, choice)]
     ranking: tuple[CandidateScore, ...] = ()
     if choice.candidate == AUTO and sum(item.fitted is not None for item in assessed) > 1:
-        fitted = [item.fitted for item in assessed]
-        ranking = rank_candidates(fitted, so_far, seed=seed)
+        pictures = [item.fitted for item in assessed]
+        ranking = rank_candidates(pictures, so_far, seed=seed)
         if judge is not None and judge.config.candidates:
-            ranking = judge_candidates(judge, ranking, fitted, context, so_far)
+            ranking = judge_candidates(judge, ranking, pictures, context, so_far)
     chosen = ranking[0].candidate if ranking else _picked(assessed, choice, context)
     if ranking:
         logger.info("round %d: candidate %d: %s", context.round_number, chosen, ranking[0].reason)
     inserted = _inserted(context, assessed, chosen, len(so_far.views), ranking)
+    fitted = assessed[chosen].fitted
+    assert fitted is not None  # noqa: S101 - `_inserted` refuses what could not be fitted
+    misaligned = report_misalignment(fitted, so_far, seed=seed)
+    logger.info("round %d: %s", context.round_number, misaligned.report.words)
+    inserted = replace(inserted, misalignment=misaligned.report, support=misaligned.support)
     warning = assessed[chosen].provenance.parameters.get("warning")
     if warning:
         logger.warning("round %d, %s: %s", context.round_number, assessed[chosen].name, warning)
@@ -70,7 +77,8 @@ def choose_view(
         (f"{scores.get(index, '')}{item.name}", None if item.fitted is None else item.fitted.image)
         for index, item in enumerate(assessed)
     ]
-    return ChosenView(inserted=inserted, sheet=contact_sheet(so_far.views, tiles, chosen=chosen))
+    sheet = contact_sheet(so_far.views, tiles, chosen=chosen)
+    return ChosenView(inserted=inserted, sheet=sheet, overlay=misaligned.overlay)
 
 
 def check_round(

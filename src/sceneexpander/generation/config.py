@@ -46,6 +46,8 @@ class ServiceConfig(GeneratorConfig):
         take: another number asks for new pictures; those made before stay in the cache, and come back with their number.
         max_requests: most requests of one run of the stage, repeated ones included.
         max_cost_usd: most that one run of the stage may cost; None: no limit.
+        max_scene_requests: most requests for a scene: all rounds, all runs; None: no limit.
+        max_scene_cost_usd: most that these may cost; None: no limit.
         price_usd: of one picture, as the service's price list says; None: not known.
         attempts: how often a request is sent that fails for a passing reason.
         timeout_s: how long an answer may take.
@@ -57,6 +59,8 @@ class ServiceConfig(GeneratorConfig):
     take: Annotated[int, Range(0, 10**6)]
     max_requests: Annotated[int, Range(1, 10_000)]
     max_cost_usd: Annotated[float, Range(0, 1e6)] | None
+    max_scene_requests: Annotated[int, Range(1, 10**6)] | None = None
+    max_scene_cost_usd: Annotated[float, Range(0, 1e6)] | None = None
     price_usd: Annotated[float, Range(0, 1e6)] | None
     attempts: Annotated[int, Range(1, 20)]
     timeout_s: Annotated[float, Range(0, 86_400, low_open=True)]
@@ -65,9 +69,10 @@ class ServiceConfig(GeneratorConfig):
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.max_cost_usd is not None and self.price_usd is None:
-            problem = "is not known, so generator.max_cost_usd cannot be kept"
-            raise UserError(problem, where="generator.price_usd", fix="set it to what one picture costs")
+        for name in ("max_cost_usd", "max_scene_cost_usd"):
+            if getattr(self, name) is not None and self.price_usd is None:
+                problem = f"is not known, so generator.{name} cannot be kept"
+                raise UserError(problem, where="generator.price_usd", fix="set it to what one picture costs")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,6 +20,7 @@ from sceneexpander.generation.config import ServiceConfig
 from sceneexpander.generation.prompt import fill_prompt
 from sceneexpander.generation.protocol import Forecast, GenerationContext, SceneSoFar
 from sceneexpander.generation.references import Reference, choose_references
+from sceneexpander.generation.spending import SceneBudget, read_spent, spent_ledger
 from sceneexpander.ingest.decode import decode_picture
 from sceneexpander.services.transport import Budget, ServiceError, ask_patiently, safe_text
 
@@ -82,10 +83,11 @@ class ServiceGenerator:
         missing = max(0, self.config.candidates - self._cache(context).count())
         if missing:
             self.service.require()
-        price = self.config.price_usd
+        price, spent = self.config.price_usd, read_spent(spent_ledger(context))
         shown = min(self.config.max_references, len(context.captured) + context.round_number - 1)
         notes = (
             f"shows the {shown} views nearest to where the motion leads, at most {self.config.reference_side_px} px long",
+            *([f"{len(spent)} requests were sent for this scene before"] if spent else []),
         )
         return Forecast(
             prompt=fill_prompt(context.spec),
@@ -101,7 +103,7 @@ class ServiceGenerator:
             context, so_far, limit=config.max_references, long_side_px=config.reference_side_px
         )
         keys = {reference.view_id: reference.pixels_sha256 for reference in references}
-        cache, budget = self._cache(context), self._budget()
+        cache, budget = self._cache(context), self._budget(context)
         candidates: list[Candidate] = []
         outcomes: list[Outcome] = []
         errors: list[ServiceError] = []
@@ -140,9 +142,12 @@ class ServiceGenerator:
             )
         return CandidateSet(round=context.round_number, candidates=tuple(candidates), outcomes=tuple(outcomes))
 
-    def _budget(self) -> Budget:
+    def _budget(self, context: GenerationContext) -> SceneBudget:
         config = self.config
-        return Budget(
+        return SceneBudget(
+            ledger=spent_ledger(context),
+            max_scene_requests=config.max_scene_requests,
+            max_scene_cost_usd=config.max_scene_cost_usd,
             section="generator",
             thing="picture",
             max_requests=config.max_requests,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Annotated, Literal
 
 from sceneexpander.errors import UserError
@@ -10,6 +11,14 @@ from sceneexpander.ranges import Range, check_ranges
 
 Fit = Literal["crop", "pad"]
 FITS: tuple[Fit, ...] = ("crop", "pad")
+
+
+class CameraAxes(StrEnum):
+    """Axes of the cameras in a ``transforms.json``: as the file says, else OpenGL's (y up, looking along -z)."""
+
+    AUTO = "auto"
+    OPENGL = "opengl"
+    OPENCV = "opencv"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,6 +34,12 @@ class IngestConfig:
         max_views: more captured views than this are refused: memory and time grow with their number.
         max_megapixels: larger pictures are refused before they are decoded, as are files of few bytes that announce many pixels.
         allow_single_view: accept a scene of one photo.
+        use_intrinsics: whether calibrated lenses that came with the pictures are believed; without, pictures are not straightened.
+        use_poses: whether camera poses that came with the pictures are believed.
+        use_depth: whether depth maps that came with the pictures are believed.
+        camera_axes: of a ``transforms.json``.
+        video_fps: frames of a video looked at: of each part of one over this many seconds the sharpest frame is a candidate.
+        video_frames: at most this many frames of a video are used, evenly over its length.
     """
 
     long_side_px: Annotated[int, Range(1, 4096)] = 336
@@ -34,6 +49,12 @@ class IngestConfig:
     max_views: Annotated[int, Range(1, 1000)] = 30
     max_megapixels: Annotated[float, Range(0, 1000, low_open=True)] = 200.0
     allow_single_view: bool = False
+    use_intrinsics: bool = True
+    use_poses: bool = True
+    use_depth: bool = True
+    camera_axes: CameraAxes = CameraAxes.AUTO
+    video_fps: Annotated[float, Range(0, 120, low_open=True)] = 2.0
+    video_frames: Annotated[int, Range(2, 1000)] = 24
 
     def __post_init__(self) -> None:
         check_ranges(self)

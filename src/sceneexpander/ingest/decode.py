@@ -94,27 +94,35 @@ class PictureHeader:
     xmp: str
 
 
-def read_picture(path: Path, *, max_megapixels: float = 200.0) -> Picture:
+def read_picture(path: Path, *, max_megapixels: float = 200.0, upright: bool = True) -> Picture:
     """Read and decode one picture file (the first frame of an animated one).
 
-    What becomes of samples, colours and transparency: see `sceneexpander.ingest.samples.to_rgb`.
+    What becomes of samples, colours and transparency: see `sceneexpander.ingest.samples.to_rgb`. Without ``upright`` the rows stay as they
+    are stored, whatever the file says of how the camera was held.
 
     Raises:
         UserError: the file is missing, empty, truncated, too large, or not a picture that can be decoded.
     """
-    return decode_picture(_read_bytes(path), name=path.name, where=path, max_megapixels=max_megapixels)
-
-
-def read_picture_header(path: Path, *, max_megapixels: float = 200.0) -> PictureHeader:
-    """What the header of a picture file says. Raises as `read_picture` does."""
     data = _read_bytes(path)
-    file_format = _checked_format(data, path)
+    return decode_picture(data, name=path.name, where=path, max_megapixels=max_megapixels, upright=upright)
+
+
+def read_picture_header(path: Path, *, max_megapixels: float = 200.0, upright: bool = True) -> PictureHeader:
+    """What the header of a picture file says. Raises as `read_picture` does."""
+    return decode_picture_header(_read_bytes(path), where=path, max_megapixels=max_megapixels, upright=upright)
+
+
+def decode_picture_header(
+    data: bytes, *, where: str | Path, max_megapixels: float = 200.0, upright: bool = True
+) -> PictureHeader:
+    """`read_picture_header` for bytes; ``where`` is what error messages name."""
+    file_format = _checked_format(data, where)
     with _quiet(file_format):
-        size = _float_colour_size(data, file_format, path, max_megapixels)
+        size = _float_colour_size(data, file_format, where, max_megapixels)
         if size is not None:
             return PictureHeader(height=size[0], width=size[1], lens=LensFacts(), xmp="")
-        image = _open(data, file_format, path, max_megapixels)
-        orientation, lens, xmp, _ = _facts(image)
+        image = _open(data, file_format, where, max_megapixels)
+        orientation, lens, xmp, _ = _facts(image, upright=upright)
     height, width = _upright_size(image, orientation)
     return PictureHeader(height=height, width=width, lens=lens, xmp=xmp)
 
@@ -129,7 +137,9 @@ def _read_bytes(path: Path) -> bytes:
     return read_plain_file(path, limit_bytes=LIMIT_BYTES)
 
 
-def decode_picture(data: bytes, *, name: str, where: str | Path, max_megapixels: float = 200.0) -> Picture:
+def decode_picture(
+    data: bytes, *, name: str, where: str | Path, max_megapixels: float = 200.0, upright: bool = True
+) -> Picture:
     """`read_picture` for bytes; ``where`` is what error messages name."""
     file_format = _checked_format(data, where)
     orientation, lens, xmp, notes = 1, LensFacts(), "", list[str]()
@@ -140,10 +150,10 @@ def decode_picture(data: bytes, *, name: str, where: str | Path, max_megapixels:
             else:
                 image = _open(data, file_format, where, max_megapixels)
                 if file_format == "TIFF":
-                    orientation, lens, xmp, notes = _facts(image)
+                    orientation, lens, xmp, notes = _facts(image, upright=upright)
                 image.load()
                 if file_format != "TIFF":  # a PNG may have its tags at the end
-                    orientation, lens, xmp, notes = _facts(image)
+                    orientation, lens, xmp, notes = _facts(image, upright=upright)
                 samples = to_rgb(image, data, where)
                 del image  # before the pixels are turned, which takes another copy
         except MemoryError:
@@ -274,11 +284,11 @@ def _exif(image: Image.Image) -> Image.Exif | None:
         return None  # a damaged tag block says nothing about the pixels
 
 
-def _facts(image: Image.Image) -> tuple[int, LensFacts, str, list[str]]:
-    """Orientation (1 to 8), what is known of the lens, the XMP packet, and notes."""
+def _facts(image: Image.Image, *, upright: bool) -> tuple[int, LensFacts, str, list[str]]:
+    """Orientation (1 to 8; 1 unless the picture is to stand ``upright``), what is known of the lens, the XMP packet, and notes."""
     exif = _exif(image)
     value = 1 if exif is None else exif.get(_EXIF_ORIENTATION, 1)
-    orientation = value if isinstance(value, int) and value in _TURNS else 1
+    orientation = value if upright and isinstance(value, int) and value in _TURNS else 1
     packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
     if isinstance(packet, bytes):
         packet = packet[:_LARGEST_XMP].decode("utf-8", "ignore")

@@ -8,9 +8,11 @@ import unicodedata
 from pathlib import Path
 
 from sceneexpander.errors import UserError
+from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.links import require_inside
-from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file
-from sceneexpander.ingest.survey import list_pictures, require_text_name, survey_pictures
+from sceneexpander.ingest.scene_file import SCENE_FILE, SceneFile, read_scene_file
+from sceneexpander.ingest.sources import Capture, read_capture
+from sceneexpander.ingest.survey import list_pictures, require_text_name
 from sceneexpander.plainfiles import list_folder, require_plain_file
 
 logger = logging.getLogger(__name__)
@@ -31,11 +33,10 @@ def scene_files(folder: Path) -> list[Path]:
         UserError: one line about a file that is missing, leads out of the folder or is no plain file, or what is wrong in ``scene.yaml``.
     """
     facts = read_scene_file(folder)
-    images = require_inside(folder / facts.images, folder, where=f"{folder / SCENE_FILE}: 'images'")
-    survey = survey_pictures(images, inside=folder)
-    for note in survey.notes:
+    capture = read_scene_capture(folder, facts, IngestConfig())
+    for note in capture.notes:
         logger.warning("%s", note)
-    files = [folder / SCENE_FILE, *survey.pictures]
+    files = [folder / SCENE_FILE, *capture.all_files]
     for spec in facts.rounds:
         if spec.inserted is not None:
             target = folder / spec.inserted
@@ -47,6 +48,19 @@ def scene_files(folder: Path) -> list[Path]:
         require_plain_file(require_inside(path, folder))
         require_text_name(path)
     return list(dict.fromkeys(files))
+
+
+def read_scene_capture(folder: Path, facts: SceneFile, config: IngestConfig) -> Capture:
+    """The capture of a scene folder, whose files all stay inside it.
+
+    Raises:
+        UserError: it cannot be used, or names a file that leads out of the folder.
+    """
+    place = require_inside(folder / facts.images, folder, where=f"{folder / SCENE_FILE}: 'images'")
+    capture = read_capture(place, config, facts.source, where=f"{folder / SCENE_FILE}: 'source'")
+    for path in capture.all_files:
+        require_inside(path, folder)
+    return capture
 
 
 def _truth_files(truth: Path, folder: Path) -> list[Path]:

@@ -12,16 +12,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.artifacts.scene import RoundSpec, Scene
+from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
 from sceneexpander.artifacts.views import LensFacts, ViewRecord, ViewSet, to_uint8
 from sceneexpander.errors import UserError, did_you_mean, printable
 from sceneexpander.ingest.bars import Bars, find_bars, find_overlay
 from sceneexpander.ingest.config import Fit, IngestConfig
 from sceneexpander.ingest.copies import Thumbnail, is_copy, thumbnail
-from sceneexpander.ingest.decode import Picture, pixel_digest, read_picture, read_picture_header
+from sceneexpander.ingest.decode import Picture, decode_picture, decode_picture_header, pixel_digest, read_picture
 from sceneexpander.ingest.fit import FittedPicture, FrameSize, common_frame, fit_picture
-from sceneexpander.ingest.links import require_inside
-from sceneexpander.ingest.listing import safe_name
+from sceneexpander.ingest.known import make_known_cameras
+from sceneexpander.ingest.lens_models import Lens, straighten_picture
+from sceneexpander.ingest.listing import read_scene_capture, safe_name
 from sceneexpander.ingest.panorama import (
     MARKED_PANORAMA,
     doubtful_shape,
@@ -31,12 +32,13 @@ from sceneexpander.ingest.panorama import (
 )
 from sceneexpander.ingest.samples import Mask, Pixels
 from sceneexpander.ingest.scene_file import SCENE_FILE, read_scene_file, same_name
-from sceneexpander.ingest.survey import survey_pictures
+from sceneexpander.ingest.sources import Capture, Shot, read_capture
 from sceneexpander.plainfiles import require_folder
 
 logger = logging.getLogger(__name__)
 
 SMALLEST_SIDE_PX = 32
+_MASK_LEVEL = 128  # grey level from which a mask's pixels are used
 _MANY = 4  # photos with the same note share one line
 _CONSTANT_SPREAD = 2.0  # grey levels: below it a picture shows nothing
 LITTLE_KEPT = 0.6  # share of a picture's area: losing more than the rest is worth a remark
@@ -48,6 +50,7 @@ class LoadedViews:
 
     views: ViewSet
     notes: tuple[str, ...]
+    known: KnownCameras | None = None
 
 
 def load_scene(folder: Path, config: IngestConfig, *, name: str | None = None) -> Scene:
@@ -63,52 +66,60 @@ def load_scene(folder: Path, config: IngestConfig, *, name: str | None = None) -
     """
     require_folder(folder, expected="a scene folder")
     facts = read_scene_file(folder)
-    images = require_inside(folder / facts.images, folder, where=f"{folder / SCENE_FILE}: 'images'")
-    survey = survey_pictures(images, inside=folder)
-    paths = _ordered(list(survey.pictures), facts.order, folder / SCENE_FILE)
-    return _scene(
-        paths, (*facts.notes, *survey.notes), facts.rounds, config, name or facts.name or folder.resolve().name
-    )
+    capture = read_scene_capture(folder, facts, config)
+    capture = replace(capture, shots=_ordered(capture.shots, facts.order, folder / SCENE_FILE))
+    return _scene(capture, facts.notes, facts.rounds, config, name or facts.name or folder.resolve().name)
 
 
 def load_photos(folder: Path, rounds: Sequence[RoundSpec], config: IngestConfig, *, name: str | None = None) -> Scene:
-    """Prepare a plain folder of photos with rounds given by the caller (see `make_round`).
+    """Prepare a capture of any kind (see `sceneexpander.ingest.sources`) with rounds given by the caller (see `make_round`).
 
     Raises:
         UserError: no rounds, or one line for each way in which the folder or a photo is unusable.
     """
     if not rounds:
         raise UserError("has no prompt", where=folder, fix="pass the sentence that says what to add")
-    survey = survey_pictures(folder)
-    return _scene(list(survey.pictures), survey.notes, tuple(rounds), config, name or folder.resolve().name)
+    return _scene(read_capture(folder, config), (), tuple(rounds), config, name or folder.resolve().name)
 
 
 def read_views(paths: Sequence[Path], config: IngestConfig, *, noticed: Sequence[str] = ()) -> LoadedViews:
+    """`read_shots` of files of which nothing else is known."""
+    return read_shots([Shot(name=path.name, picture=path) for path in paths], config, noticed=noticed)
+
+
+def read_shots(
+    shots: Sequence[Shot], config: IngestConfig, *, noticed: Sequence[str] = (), metric: bool = False
+) -> LoadedViews:
     """Read, check and fit captured photos. The first one decides the common aspect ratio.
 
     Left out, with a note: panoramas and strips, which no pinhole camera took; photos that are the same picture as an earlier one, to the
     pixel or saved again, because a view without a baseline tells geometry nothing. Not valid in the result: what is transparent, the
-    border of ``fit=pad``, bars of one colour, and strips that are the same in all photos.
+    border of ``fit=pad``, bars of one colour, strips that are the same in all photos, and what masks leave out.
+
+    Pictures of calibrated lenses are straightened, so that what is stored is a pinhole camera's.
 
     Args:
-        paths: the photos, in order.
-        config: stored size and limits.
+        shots: the photos and what came with them, in order.
+        config: stored size, limits, and what is believed.
         noticed: notes that come first.
+        metric: whether the unit of the photos' poses and depth is the metre.
 
     Raises:
         UserError: a photo is unusable, or there are too few or too many.
     """
     notes = list(noticed)
-    _check_count(len(paths), paths, config)
-    usable, frame = _usable(paths, config, notes)
+    shots = [_believed(shot, config) for shot in shots]
+    where = _place_of(shots)
+    _check_count(len(shots), where, config)
+    usable, frame = _usable(shots, config, notes)
     parts: list[ViewSet] = []
+    kept: list[tuple[Shot, FittedPicture, tuple[int, int]]] = []
     seen: list[_Seen] = []
-    for path in usable:  # one at a time: thirty camera originals at once would not fit in memory
-        picture = read_picture(path, max_megapixels=config.max_megapixels)
+    for shot in usable:  # one at a time: thirty camera originals at once would not fit in memory
+        picture, lens = _read_shot(shot, config, notes)
         shown = printable(picture.name)
-        reason = _nothing_to_see(picture.pixels) or panorama_reason(
-            picture.pixels, picture.xmp, has_lens=_knows_lens(picture.lens)
-        )
+        known = lens is not None or _knows_lens(picture.lens)
+        reason = _nothing_to_see(picture.pixels) or panorama_reason(picture.pixels, picture.xmp, has_lens=known)
         if reason is not None:
             notes.append(f"{shown}: {reason}; left out")
             continue
@@ -119,16 +130,70 @@ def read_views(paths: Sequence[Path], config: IngestConfig, *, noticed: Sequence
             notes.append(f"{shown}: {same} {twin.name}, left out and counted once")
             continue
         seen.append(this)
-        remarks = [*picture.notes, doubtful_shape(picture.height, picture.width, has_lens=_knows_lens(picture.lens))]
+        remarks = [*picture.notes, doubtful_shape(picture.height, picture.width, has_lens=known)]
         notes += [f"{shown}: {note}" for note in remarks if note is not None]
-        parts.append(_fitted_view(picture, frame, config.fit, len(parts), notes))
-    _check_count(len(parts), paths, config, distinct=" different", notes=notes[len(noticed) :])
+        view, fitted = _fitted_view(picture, frame, config.fit, len(parts), notes)
+        parts.append(view)
+        kept.append((replace(shot, lens=lens), fitted, picture.shape))
+    _check_count(len(parts), where, config, distinct=" different", notes=notes[len(noticed) :])
     views = parts[0]
     for part in parts[1:]:
         views = views.append(part)
     if len({this.shape for this in seen}) == 1:
         views = _without_overlay(views, notes)
-    return LoadedViews(views=views, notes=_gathered(notes))
+    known_cameras = make_known_cameras(kept, (frame.height, frame.width), metric=metric)
+    return LoadedViews(views=views, notes=_gathered(notes), known=known_cameras)
+
+
+def _believed(shot: Shot, config: IngestConfig) -> Shot:
+    """The shot without what the configuration does not believe."""
+    return replace(
+        shot,
+        lens=shot.lens if config.use_intrinsics else None,
+        world_from_cam=shot.world_from_cam if config.use_poses else None,
+        depth=shot.depth if config.use_depth else None,
+    )
+
+
+def _place_of(shots: Sequence[Shot]) -> Path | None:
+    first = shots[0].picture if shots else None
+    return first.parent if isinstance(first, Path) else None
+
+
+def _read_shot(shot: Shot, config: IngestConfig, notes: list[str]) -> tuple[Picture, Lens | None]:
+    """The picture, masked and straightened, and its lens at the picture's size."""
+    where: str | Path = shot.picture if isinstance(shot.picture, Path) else shot.name
+    picture = decode_picture(
+        shot.data(),
+        name=Path(shot.name).name,
+        where=where,
+        max_megapixels=config.max_megapixels,
+        upright=not shot.calibrated,
+    )
+    valid = picture.valid
+    if shot.mask is not None:
+        mask = read_picture(shot.mask, max_megapixels=config.max_megapixels, upright=not shot.calibrated)
+        if mask.shape != picture.shape:
+            sizes = f"{mask.width} x {mask.height}, the picture {picture.width} x {picture.height}"
+            raise UserError(f"is not as large as its picture ({sizes})", where=shot.mask)
+        used = mask.pixels.max(axis=-1) >= _MASK_LEVEL
+        valid = used if valid is None else valid & used
+        if not valid.any():
+            raise UserError("leaves nothing of its picture", where=shot.mask)
+    if shot.lens is None:
+        return replace(picture, valid=valid), None
+    lens = shot.lens.of_size(picture.shape)
+    if lens is None:
+        height, width = shot.lens.size or (0, 0)
+        problem = f"has {picture.width} x {picture.height} pixels, its camera was calibrated for {width} x {height}"
+        raise UserError(
+            problem, where=where, fix="use the pictures that were calibrated, or scene.use_intrinsics=false"
+        )
+    if not lens.bends:
+        return replace(picture, valid=valid), lens
+    pixels, valid = straighten_picture(picture.pixels, valid, lens)
+    notes.append(f"{printable(picture.name)}: its lens ({lens.projection}) was straightened as calibrated")
+    return replace(picture, pixels=pixels, valid=valid), lens
 
 
 def _gathered(notes: Sequence[str]) -> tuple[str, ...]:
@@ -160,20 +225,23 @@ class _Seen:
         return self.digest == other.digest or is_copy(self.small, other.small, aspects=aspects)
 
 
-def _usable(paths: Sequence[Path], config: IngestConfig, notes: list[str]) -> tuple[list[Path], FrameSize]:
+def _usable(shots: Sequence[Shot], config: IngestConfig, notes: list[str]) -> tuple[list[Shot], FrameSize]:
     """The photos that a pinhole camera may have taken, by their headers, and the frame for them."""
     usable, sizes = [], []
-    for path in paths:
-        header = read_picture_header(path, max_megapixels=config.max_megapixels)
+    for shot in shots:
+        where: str | Path = shot.picture if isinstance(shot.picture, Path) else shot.name
+        header = decode_picture_header(
+            shot.data(), where=where, max_megapixels=config.max_megapixels, upright=not shot.calibrated
+        )
         reason = strip_reason(header.height, header.width)
         if reason is None and is_marked_panorama(header.xmp):
             reason = MARKED_PANORAMA
         if reason is not None:
-            notes.append(f"{printable(path.name)}: {reason}; left out")
+            notes.append(f"{printable(Path(shot.name).name)}: {reason}; left out")
             continue
-        usable.append(path)
+        usable.append(shot)
         sizes.append((header.height, header.width))
-    _check_count(len(usable), paths, config, distinct=" usable", notes=notes)
+    _check_count(len(usable), _place_of(shots), config, distinct=" usable", notes=notes)
     frame = common_frame(
         sizes,
         long_side_px=config.long_side_px,
@@ -200,7 +268,9 @@ def _knows_lens(lens: LensFacts) -> bool:
     return lens.focal_mm is not None or lens.focal_px is not None
 
 
-def _fitted_view(picture: Picture, frame: FrameSize, fit: Fit, index: int, notes: list[str]) -> ViewSet:
+def _fitted_view(
+    picture: Picture, frame: FrameSize, fit: Fit, index: int, notes: list[str]
+) -> tuple[ViewSet, FittedPicture]:
     shown = printable(picture.name)
     bars = find_bars(picture.pixels)
     if bars:
@@ -208,7 +278,7 @@ def _fitted_view(picture: Picture, frame: FrameSize, fit: Fit, index: int, notes
     fitted = fit_picture(picture.pixels, frame, fit, valid=without_bars(picture, bars))
     if fitted.kept < LITTLE_KEPT:
         notes.append(f"{shown}: only {fitted.kept:.0%} of it fits the frame of the first view")
-    return view_from_fitted(picture, fitted, view_id=f"{index:03d}_{safe_name(Path(picture.name).stem)}")
+    return view_from_fitted(picture, fitted, view_id=f"{index:03d}_{safe_name(Path(picture.name).stem)}"), fitted
 
 
 def without_bars(picture: Picture, bars: Bars) -> Mask | None:
@@ -261,17 +331,24 @@ def image_tensor(pixels: Pixels) -> Float[Tensor, "3 height width"]:
 
 
 def _scene(
-    paths: list[Path], noticed: Sequence[str], rounds: tuple[RoundSpec, ...], config: IngestConfig, name: str
+    capture: Capture, noticed: Sequence[str], rounds: tuple[RoundSpec, ...], config: IngestConfig, name: str
 ) -> Scene:
-    loaded = read_views(paths, config, noticed=noticed)
+    loaded = read_shots(capture.shots, config, noticed=(*noticed, *capture.notes), metric=capture.metric)
     for note in loaded.notes:
         logger.warning("%s", note)
-    return Scene(name=safe_name(name, fallback="scene"), views=loaded.views, rounds=rounds, notes=loaded.notes)
+    return Scene(
+        name=safe_name(name, fallback="scene"),
+        views=loaded.views,
+        rounds=rounds,
+        known=loaded.known,
+        notes=loaded.notes,
+    )
 
 
-def _ordered(paths: list[Path], order: tuple[str, ...], scene_file: Path) -> list[Path]:
-    by_name = {path.name: path for path in paths}
-    alike = {same_name(path.name): path.name for path in paths}
+def _ordered(shots: tuple[Shot, ...], order: tuple[str, ...], scene_file: Path) -> tuple[Shot, ...]:
+    names = [Path(shot.name).name for shot in shots]
+    by_name = dict(zip(names, shots, strict=True))
+    alike = {same_name(name): name for name in names}
     first: list[str] = []
     for name in order:
         found = name if name in by_name else alike.get(same_name(name))
@@ -280,13 +357,13 @@ def _ordered(paths: list[Path], order: tuple[str, ...], scene_file: Path) -> lis
                 f"'order' names {name!r}, which is not there", where=scene_file, fix=did_you_mean(name, by_name)
             )
         first.append(found)
-    return [by_name[name] for name in first] + [path for path in paths if path.name not in first]
+    rest = tuple(shot for name, shot in zip(names, shots, strict=True) if name not in first)
+    return (*(by_name[name] for name in first), *rest)
 
 
 def _check_count(
-    count: int, paths: Sequence[Path], config: IngestConfig, *, distinct: str = "", notes: Sequence[str] = ()
+    count: int, where: Path | None, config: IngestConfig, *, distinct: str = "", notes: Sequence[str] = ()
 ) -> None:
-    where = paths[0].parent if paths else None
     needed = 1 if config.allow_single_view else 2
     if count < needed:
         # What was left out is the reason, so it belongs into the line.

@@ -17,20 +17,24 @@ from sceneexpander.plainfiles import read_plain_file
 from sceneexpander.yamlfile import read_user_yaml
 
 SCENE_FILE = "scene.yaml"
-_SCENE_KEYS = frozenset({"name", "source", "licence", "rounds", "order", "images", "notes"})
+_SCENE_KEYS = frozenset({"name", "source", "origin", "licence", "rounds", "order", "images", "notes"})
 _ROUND_KEYS = frozenset({"prompt", "motion", "object", "inserted"})
 _SENTENCES = frozenset({"prompt", "motion", "object"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneFile:
-    """The content of ``scene.yaml``, checked. ``images`` is the folder of the captured photos, relative to the scene's.
+    """The content of ``scene.yaml``, checked.
+
+    ``images`` is the folder of the captured photos, or the file or folder that a capture of another kind is in, relative to the scene's.
+    ``source`` is the kind (see `sceneexpander.ingest.sources`), ``origin`` where the data is from, for people.
 
     ``notes`` were made when the folder was put together from other files, which are not in it.
     """
 
     name: str | None
     source: str
+    origin: str
     licence: str
     images: str
     order: tuple[str, ...]  # file names that come first, in this order; empty: natural order
@@ -57,7 +61,8 @@ def read_scene_file(folder: Path) -> SceneFile:
     images = _text(content, "images", path, "the file")
     return SceneFile(
         name=_text(content, "name", path, "the file") or None,
-        source=_text(content, "source", path, "the file"),
+        source=_source(content, path),
+        origin=_text(content, "origin", path, "the file"),
         licence=_text(content, "licence", path, "the file"),
         images=_existing(folder, images, f"{path}: 'images'") if images else "captured",
         order=_names(content.get("order"), path),
@@ -85,6 +90,17 @@ def _text(content: dict[str, Any], key: str, path: Path, what: str) -> str:
         quote = "put it in quotes" if isinstance(value, bool) else None
         raise UserError(f"{key!r} of {what} is a {kind}, expected text", where=path, fix=quote)
     return " ".join(value.split())
+
+
+def _source(content: dict[str, Any], path: Path) -> str:
+    name = _text(content, "source", path, "the file") or "auto"
+    if " " in name:
+        raise UserError(
+            f"'source' is {printable(name[:60])!r}, no kind of data",
+            where=path,
+            fix="write where it is from as 'origin: ...'",
+        )
+    return name
 
 
 def _names(value: object, path: Path) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from sceneexpander.ingest.formats import PICTURE_EXTENSIONS, kind_of_file, sniff
 from sceneexpander.ingest.links import require_inside
 from sceneexpander.plainfiles import kind_of, list_folder, require_plain_file
 
+MASKS_FOLDER = "masks"  # beside pictures: which of their pixels are to be used
 _HEAD_BYTES = 64
 _MOST_LISTED = 8  # names in one line
 _MOST_LOOKED_AT = 2000  # files of sub-folders, when there is no picture in the folder itself

@@ -78,20 +78,3 @@ class OptimiseConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RefineConfig:
-    """How long and how fast the short fit (`refine`) is. Rates are Adam's; that of the means is in units of the scene's extent."""
-
-    visits: Steps = 0  # steps per view: a view more takes nothing from the others; 0: Gaussians stay as made
-    means: Rate = 1e-3
-    scales: Rate = 5e-2
-    rotations: Rate = 3e-3
-    opacities: Rate = 0.3
-    colours: Rate = 3e-2
-    ssim_weight: Share = 0.2  # of 1 - SSIM beside the mean absolute error
-    solid_weight: Weight = 0.1  # of the light that passes through what a picture shows
-
-    def __post_init__(self) -> None:
-        check_ranges(self)

@@ -76,7 +76,7 @@ def optimise(
     """Optimise the Gaussians of ``start`` on the pictures of its views, generated ones included.
 
     Pictures are taken at several sizes and before backgrounds of random colours, and no Gaussian gets narrower than what its finest view
-    resolves, as in `sceneexpander.optimisation.refine`. Views without a known camera are left out. On a CPU the same input gives the
+    resolves, as in `sceneexpander.photometric.refine`. Views without a known camera are left out. On a CPU the same input gives the
     same bits, interrupted or not.
 
     Args:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sceneexpander.adaptation.warmup import WarmupConfig, WarmupReport, warm_up
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
+from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.frontend.sfm import SparseReconstruction
+from sceneexpander.photometric.config import WarmupConfig
+from sceneexpander.photometric.report import FitReport
+from sceneexpander.photometric.warmup import warm_up
 from sceneexpander.reconstruction.cameras import announce_cameras, report_cameras, straighten_views
 from sceneexpander.reconstruction.loaded import LoadedModel
 from sceneexpander.reconstruction.views import device_priors, reconstruct, views_priors
@@ -23,12 +26,14 @@ def initial_state(
     *,
     seed: int,
     on_step: Callable[[int, float], None] | None = None,
-) -> tuple[ExpansionState, Reconstruction, SparseReconstruction | None, WarmupReport | None]:
+    memory: MatchMemory | None = None,
+) -> tuple[ExpansionState, Reconstruction, SparseReconstruction | None, FitReport | None]:
     """Round 0: the captured views, their geometry, theta_0 (after the optional warm-up), and what the model makes of them.
 
     The state's views are pinhole pictures: what the lens bent is straightened, here and for all that follows.
+    ``memory`` learns the photos' keypoints and matches.
     """
-    priors, sparse = views_priors(scene.views, loaded, frontend, seed=seed, known=scene.known)
+    priors, sparse = views_priors(scene.views, loaded, frontend, seed=seed, known=scene.known, memory=memory)
     views = scene.views
     if sparse is not None:
         views = straighten_views(views, sparse)

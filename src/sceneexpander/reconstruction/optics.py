@@ -20,25 +20,32 @@ def known_of(views: ViewSet, known: KnownCameras | None) -> KnownCameras | None:
     """The known cameras with a row for every view: those that came later, after the views that the cameras belong to, have none.
 
     Their poses are not finite, which the front-end takes for unknown. Known intrinsics are kept as they are, so the front-end wants them
-    of all views: a picture that was drawn with the photos gets their focal lengths (in stored pixels) and its own centre.
+    of all views: one without, a generated picture or one of a partly calibrated capture, gets the others' focal lengths (in stored pixels)
+    and its own centre.
     """
     if known is None:
         return None
-    poses, intrinsics = known.world_from_cam, known.intrinsics_px
+    poses, intrinsics, depth = known.world_from_cam, known.intrinsics_px, known.depth
     if poses is not None:
         missing = poses.new_full((len(views) - len(poses), 4, 4), float("nan"))
         poses = torch.cat([poses, missing])
     if intrinsics is not None:
-        focals = intrinsics[:, [0, 1], [0, 1]].median(dim=0).values
-        rows = [intrinsics]
-        for record in views.records[len(intrinsics) :]:
+        given = torch.isfinite(intrinsics).all(-1).all(-1)
+        focals = intrinsics[given][:, [0, 1], [0, 1]].median(dim=0).values
+        rows = []
+        for view, record in enumerate(views.records):
+            if view < len(intrinsics) and bool(given[view]):
+                rows.append(intrinsics[view])
+                continue
             affine = intrinsics.new_tensor(record.stored_from_original)
             middle = intrinsics.new_tensor([record.original_width / 2, record.original_height / 2])
             row = torch.eye(3).to(intrinsics)
             row[[0, 1], [0, 1]], row[:2, 2] = focals, affine[:, :2] @ middle + affine[:, 2]
-            rows.append(row[None])
-        intrinsics = torch.cat(rows)
-    return replace(known, world_from_cam=poses, intrinsics_px=intrinsics)
+            rows.append(row)
+        intrinsics = torch.stack(rows)
+    if depth is not None:
+        depth = torch.cat([depth, depth.new_zeros(len(views) - len(depth), *depth.shape[1:])])
+    return replace(known, world_from_cam=poses, intrinsics_px=intrinsics, depth=depth)
 
 
 def _optics(record: ViewRecord) -> ViewOptics:

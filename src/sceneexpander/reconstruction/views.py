@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import logging
+from dataclasses import fields, replace
 
 import torch
 
@@ -12,6 +13,8 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.frontend.known_check import find_contradictions
+from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
 from sceneexpander.geometry.gauge import in_gauge_of
@@ -23,6 +26,8 @@ from sceneexpander.reconstruction.cameras import announce_cameras, report_camera
 from sceneexpander.reconstruction.loaded import LoadedModel
 from sceneexpander.reconstruction.optics import known_of, optics_of
 
+_log = logging.getLogger(__name__)
+
 
 def views_priors(
     views: ViewSet,
@@ -31,14 +36,17 @@ def views_priors(
     *,
     seed: int,
     known: KnownCameras | None = None,
+    memory: MatchMemory | None = None,
 ) -> tuple[Priors, SparseReconstruction | None]:
-    """What the model is told about the views: the front-end's estimate, or nothing if the model asks for nothing.
+    """What the model is told about the views: the front-end's estimate; for a model that asks for none, what is ``known``.
 
-    ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told.
+    ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told. Whatever is known
+    is compared with the pictures first, and left out where they contradict it.
+    ``memory`` spares it pictures and pairs that it has seen before, and learns those that it has not.
     """
-    if not loaded.uses_front_end:
-        return Priors(), None
     known = known_of(views, known)
+    if not loaded.uses_front_end:
+        return (Priors() if known is None else _known_priors(views, known, frontend, seed=seed)), None
     if any(
         record.distortion != (0.0, 0.0) for record in views.records
     ):  # straightened before; what is left is nothing to look for
@@ -50,10 +58,38 @@ def views_priors(
         feature_images=views.detail_images,
         known_intrinsics_px=None if known is None else known.intrinsics_px,
         known_world_from_cam=None if known is None else known.world_from_cam,
+        known_depth=None if known is None else known.depth,
         names=[record.name for record in views.records],
         optics=optics_of(views),
         valid=views.valid,
+        memory=memory,
     )
+
+
+def _known_priors(views: ViewSet, known: KnownCameras, frontend: FrontendConfig, *, seed: int) -> Priors:
+    """Known cameras and depth as they are, in the frame of the first view that has a pose."""
+    poses, intrinsics = known.world_from_cam, known.intrinsics_px
+    contradictions = find_contradictions(
+        views.images,
+        frontend.sfm,
+        generator=child_generator(seed, "known"),
+        feature_images=views.detail_images,
+        intrinsics_px=intrinsics,
+        world_from_cam=poses,
+        names=[record.name for record in views.records],
+        valid=views.valid,
+    )
+    for note in contradictions.notes:
+        _log.warning("%s", note)
+    if contradictions.intrinsics:
+        intrinsics = None
+    posed = None
+    if poses is not None:
+        posed = torch.isfinite(poses).all(-1).all(-1) & ~contradictions.poses
+        poses = torch.where(posed[:, None, None], poses, torch.eye(4).to(poses))
+        if not bool(posed.any()):
+            poses = posed = None
+    return Priors(world_from_cam=poses, intrinsics_px=intrinsics, depth=known.depth, posed=posed)
 
 
 @torch.no_grad()
@@ -72,7 +108,8 @@ def reconstruct(
     return as_reconstruction(
         predict(views, priors, loaded, weights),
         views,
-        priors,
+        # A model without the front-end predicts the cameras that it is not told.
+        priors if loaded.uses_front_end else replace(priors, posed=None),
         method=method,
         model=loaded.model.name,
         weights_sha256=loaded.fingerprint(weights),
@@ -104,14 +141,16 @@ def joint_reconstruction(
     frontend: FrontendConfig,
     *,
     seed: int,
+    memory: MatchMemory | None = None,
 ) -> tuple[Priors, Reconstruction, SparseReconstruction | None]:
     """The baseline: the unadapted model given all views as they are, the inserted one last and treated like any other.
 
     In every round: its weights are those of round 0, and no picture is in another tone. The priors come back in the frame and scale of
     the state's, so that what was known before can be compared with them; the front-end's own findings are in their own scale.
+    ``memory`` is that of round 0.
     """
     views = state.views.append(inserted.view)
-    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known)
+    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known, memory=memory)
     priors = in_gauge_of(state.priors, priors)
     if sparse is not None:
         announce_cameras(
@@ -122,4 +161,5 @@ def joint_reconstruction(
 
 def device_priors(priors: Priors, loaded: LoadedModel) -> Priors | None:
     """The priors where the model is; None for a model that is told nothing."""
-    return priors.to(loaded.device) if loaded.uses_front_end else None
+    given = any(getattr(priors, field.name) is not None for field in fields(priors))
+    return priors.to(loaded.device) if given else None

@@ -180,6 +180,7 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
     sheet = source.inserted / "sheet.png"
     if sheet.is_file():
         shutil.copyfile(sheet, folder / base / "sheet.png")
+    overlay = source.inserted / "overlay.png"
     spec = scene.round_spec(source.number)
     cameras = gathered_cameras(source.cameras)
     looks = _looks(source.log.parent, folder, base)
@@ -204,6 +205,8 @@ def _round(source: RoundSource, scene_source: SceneSource, scene: Scene, folder:
         inserted_id=inserted.view.view_ids[0],
         viewer=_viewer_place(source.number),
         sheet=f"{base}/sheet.png" if sheet.is_file() else None,
+        overlay=_copy(overlay, folder, f"{base}/overlay.png") if overlay.is_file() else None,
+        misalignment=None if inserted.misalignment is None else inserted.misalignment.words,
         methods=tuple(methods),
         unavailable=tuple(
             MissingMethod(

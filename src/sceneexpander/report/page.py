@@ -72,6 +72,8 @@ def _round(page: RoundPage, scene: ScenePage, folder: Path) -> _Filled:
         "page": page,
         "made": PICTURE_KINDS.get(page.source_type or "", "Picture"),
         "reasons": [f"candidate {score.candidate}: {score.reason}" for score in page.ranking],
+        "overlay": page.overlay,
+        "misalignment": page.misalignment,
         "sheet": page.sheet if page.candidates > 1 else None,
         "methods": [_shown_method(method, labels[method.name]) for method in page.methods],
         "main": MAIN,

@@ -67,11 +67,11 @@ class Budget:
         """Count one request. Raises `ServiceError` if it is one too many."""
         fix = "raise it and start again: what came is kept"
         if self.sent >= self.max_requests:
-            problem = f"{self.sent} requests were sent, as many as {self.section}.max_requests allows"
+            problem = f"{self.sent} requests were sent: one more is beyond {self.section}.max_requests"
             raise ServiceError("failed_final", problem, fix=fix)
         if self.max_cost_usd is not None and (self.sent + 1) * (self.price_usd or 0.0) > self.max_cost_usd:
             limit = f"{self.section}.max_cost_usd ({self.max_cost_usd:g})"
-            raise ServiceError("failed_final", f"one more {self.thing} would cost more than {limit}", fix=fix)
+            raise ServiceError("failed_final", f"one more {self.thing} is beyond {limit}", fix=fix)
         self.sent += 1
 
 

@@ -211,7 +211,7 @@ def _write(path: Path, pixels: NDArray[Any]) -> None:
 
 _DESCRIPTION: dict[str, Any] = {
     "name": "courtyard",
-    "source": "made for this project by scripts/make_courtyard.py; every surface is procedural",
+    "origin": "made for this project by scripts/make_courtyard.py; every surface is procedural",
     "licence": "same as this repository; no third-party material",
     "rounds": [
         {

@@ -33,6 +33,9 @@ class Misalignment:
         deform_fraction: objects move horizontally by up to this share of the scene size, and change size by up to twice it.
         deform_share: share of the objects that do so.
         warp_fraction: largest displacement of the smooth image warp, relative to the image width.
+        stretch: the picture is that much wider at the same height, as when an editor works at a ratio of its own.
+        zoom: everything is drawn larger by this share, about the middle of the picture.
+        shift_fraction: everything is drawn that far from its place, relative to the image width, in a random direction.
         exposure_stops: exposure difference (powers of two, linear light).
         white_balance: gains of red and blue differ from green by this factor, one up and one down.
         hallucinate: add an object that is neither in the scene nor asked for.
@@ -43,6 +46,9 @@ class Misalignment:
     deform_fraction: float = 0.0
     deform_share: float = 0.6
     warp_fraction: float = 0.0
+    stretch: float = 0.0
+    zoom: float = 0.0
+    shift_fraction: float = 0.0
     exposure_stops: float = 0.0
     white_balance: float = 0.0
     hallucinate: bool = False
@@ -75,7 +81,8 @@ class MisalignedView:
         misalignment: the amounts asked for. scene_size_m: the length the fractions refer to.
         world_from_used_cam: (4,4) the pose it was rendered from (the true pose is the caller's).
         moved: per deformed object: name, index, shift in metres, size factor.
-        warp_px: (H,W,2) displacement d: picture(p) shows what lies at p + d(p) of the unwarped rendering.
+        warp_px: (H,W,2) displacement d: picture(p) shows what lies at p + d(p) of what the used camera sees through the true lens,
+            whether inside its frame or beyond. Warp, stretch, zoom and shift together.
         gains: linear RGB gains of exposure and white balance.
         object_id: (H,W) int32 objects as seen in the warped picture (ids of ``world``).
         world: the deformed world it was rendered from.
@@ -165,6 +172,38 @@ def smooth_warp(height: int, width: int, largest_px: float, generator: np.random
     return field * np.float32(largest_px / longest)
 
 
+def framed_intrinsics(
+    intrinsics_px: NDArray[np.float64],
+    height: int,
+    width: int,
+    misalignment: Misalignment,
+    generator: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Intrinsics of a camera that draws everything stretched, zoomed and shifted as asked; the direction of the shift is drawn."""
+    m = misalignment
+    shift = np.zeros(2)
+    if m.shift_fraction:
+        angle = np.random.default_rng(generator.integers(2**32)).uniform(0, 2 * np.pi)
+        shift = m.shift_fraction * width * np.array([np.cos(angle), np.sin(angle)])
+    scale = (1 + m.zoom) * np.array([1 + m.stretch, 1.0])
+    middle = np.array([width, height]) / 2
+    framed = intrinsics_px.copy()
+    framed[:2] *= scale[:, None]
+    framed[:2, 2] += middle * (1 - scale) + shift
+    return framed
+
+
+def displacement_px(
+    smooth_px: Array, used_intrinsics_px: NDArray[np.float64], true_intrinsics_px: NDArray[np.float64]
+) -> Array:
+    """(H,W,2) the displacement of a smooth warp followed by that of drawing through other intrinsics than the true ones."""
+    height, width = smooth_px.shape[:2]
+    own = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    true_from_used = true_intrinsics_px @ np.linalg.inv(used_intrinsics_px)
+    there = (own + smooth_px) @ true_from_used[:2, :2].T + true_from_used[:2, 2]
+    return (there - own).astype(np.float32)
+
+
 def warp_image(image: Array, warp_px: Array, *, nearest: bool = False) -> Array:
     """``image`` at p + warp(p): bilinear (or nearest, for labels), edges repeated."""
     height, width = image.shape[:2]
@@ -229,7 +268,8 @@ def misalign(
         )
     if m.hallucinate:
         bent = hallucinated_object(bent, pose, scene_size, np.random.default_rng(generator.integers(2**32)))
-    rendered: RenderedViews = render_world(bent, pose[None], intrinsics_px[None], height, width, **render_options)
+    used = framed_intrinsics(intrinsics_px, height, width, m, generator)
+    rendered: RenderedViews = render_world(bent, pose[None], used[None], height, width, **render_options)
     warp = smooth_warp(height, width, m.warp_fraction * width, generator)
     gain = 2.0**m.exposure_stops
     gains = (gain * (1 + m.white_balance), gain, gain / (1 + m.white_balance))
@@ -237,5 +277,5 @@ def misalign(
     ids = warp_image(rendered.object_id[0].astype(np.float32), warp, nearest=True).astype(np.int32)
     return MisalignedView(
         image=encode_radiance(radiance, exposure), misalignment=m, scene_size_m=scene_size, world_from_used_cam=pose,
-        moved=moved, warp_px=warp, gains=gains, object_id=ids, world=bent,
+        moved=moved, warp_px=displacement_px(warp, used, intrinsics_px), gains=gains, object_id=ids, world=bent,
     )  # fmt: skip

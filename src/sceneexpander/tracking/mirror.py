@@ -76,6 +76,7 @@ def _run(
             "mlflow.source.git.commit": commit,
             NOTE_TAG: run_note(item.prompt, method_title(name, row.model) + row.fit.mark, row, cameras, item.warnings),
             **_camera_tags(cameras),
+            **({"misalignment": cut(item.misalignment)} if item.misalignment else {}),
             **({LIVE_TAG: item.looks.identity} if adapted and item.looks else {}),
         },
         started_ms=int(1000 * min((run.started for run in stages.values()), default=0.0)),
@@ -136,7 +137,7 @@ def _belongs(stage: str, method: str) -> bool:
 
 
 def _artefacts(item: RoundPage, method: MethodPage, folder: Path, extra: Sequence[Path]) -> dict[str, Path]:
-    places = {"inserted": [item.inserted, *([item.sheet] if item.sheet else [])]}
+    places = {"inserted": [item.inserted, *(place for place in (item.sheet, item.overlay) if place)]}
     places["videos"] = list(method.videos.values())
     places["stills"] = [path for still in method.stills for path in still.pictures.values()]
     places["views"] = list(method.view_pictures.values())

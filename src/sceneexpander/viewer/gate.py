@@ -34,7 +34,9 @@ def check_authority(text: str) -> str:
     return text.lower()
 
 
-def reason_to_refuse(hosts: Sequence[str], origins: Sequence[str], port: int, allowed: Sequence[str]) -> str | None:
+def reason_to_refuse(
+    hosts: Sequence[str], origins: Sequence[str], port: int, allowed: Sequence[str], *, server: str = "viewer"
+) -> str | None:
     """Why a request is refused, or None if it may pass.
 
     Args:
@@ -42,18 +44,19 @@ def reason_to_refuse(hosts: Sequence[str], origins: Sequence[str], port: int, al
         origins: values of its Origin headers; programs that are no browsers send none.
         port: on which it came in.
         allowed: names besides the loopback ones, as `check_authority` gives them.
+        server: what it is called in the answer.
     """
     own = {f"{name}:{port}" for name in LOOPBACK_NAMES} | set(allowed)
     if port == _DEFAULT_PORT:
         own |= set(LOOPBACK_NAMES)
     if len(hosts) != 1 or hosts[0].lower() not in own:
-        return f"this viewer does not answer to the name {', '.join(hosts) or 'that is missing'}"
+        return f"this {server} does not answer to the name {', '.join(hosts) or 'that is missing'}"
     if len(origins) > 1:
         return "a page has one origin"
     for origin in origins:
         authorities = {origin.lower().removeprefix(scheme) for scheme in _SCHEMES if origin.lower().startswith(scheme)}
         if not authorities & own:
-            return f"pages of {origin} may not talk to this viewer"
+            return f"pages of {origin} may not talk to this {server}"
     return None
 
 

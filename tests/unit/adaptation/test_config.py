@@ -8,7 +8,6 @@ from sceneexpander.adaptation.config import (
     DriftForm,
     Gauge,
     InsertedWeights,
-    Realign,
     Spend,
     SubsetRule,
     Trainable,
@@ -43,13 +42,9 @@ OPEN = {
     "warp_targets": False,
 }
 BEYOND = {
-    "splat_steps": 0,
+    "alpha_gaussian": 0.0,
     "inserted_weights": InsertedWeights.UNIFORM,
     "spend": Spend.ALWAYS,
-    "realign": Realign.NONE,
-    "tone": False,
-    "trust": False,
-    "close_gaps": 0.0,
 }
 
 

@@ -120,7 +120,19 @@ def test_bash_completes_commands_and_options(tmp_path: Path, words: list[str], e
 
 @pytest.mark.parametrize(
     "module",
-    ["ablation", "conformance", "convert_checkpoint", "expand", "follow", "judge_run", "plan", "sweep", "ui", "viewer"],
+    [
+        "ablation",
+        "conformance",
+        "convert_checkpoint",
+        "expand",
+        "follow",
+        "judge_run",
+        "plan",
+        "study",
+        "sweep",
+        "ui",
+        "viewer",
+    ],
 )
 def test_the_module_of_a_command_can_be_run_as_well(module: str) -> None:
     path = ROOT / "src" / "sceneexpander" / module

@@ -12,19 +12,30 @@ from typing import Any
 import pytest
 import yaml
 
-from sceneexpander.adaptation.config import AdaptConfig, Realign, Spend
-from sceneexpander.config.compose import FORBIDDEN_KEYS, compose, refuse_forbidden_keys, scene_option
+from sceneexpander.adaptation.config import AdaptConfig, Spend
+from sceneexpander.config.compose import (
+    _RENAMED,
+    _RENAMED_OPTIONS,
+    FORBIDDEN_KEYS,
+    compose,
+    known_keys,
+    options_of,
+    refuse_forbidden_keys,
+    scene_option,
+)
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.insertion.config import CorrectionsConfig
 
 CONF = Path(__file__).parents[3] / "conf"
 NEEDED = {"model=worldmirror": ["model.weights=x.safetensors"], "generator=file": ["generator.file=x.png"]}
-NEEDED |= {"generator=comfyui": ["generator.workflow=x.json"]}
+NEEDED |= {"generator=comfyui": ["generator.workflow=x.json"], "generator=diffusers": ["generator.model=x/y"]}
 NEEDED |= {"tracking=server": ["tracking.uri=http://127.0.0.1:5000"]}
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
 OPTIONS = sorted(f"{group}={path.stem}" for group in GROUPS for path in (CONF / group).glob("*.yaml"))
 ABLATIONS = sorted(path.stem for path in (CONF / "ablation").glob("*.yaml"))
-TABLE_ROWS = {"baseline", "anchor", "subset_aug", "self_distill", "self_distill_p1", "full"}
+MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
+TABLE_ROWS = {"baseline", "anchor", "subset_aug", "self_distill", "self_distill_p1", "paper"}
 
 
 @cache
@@ -64,19 +75,80 @@ def test_no_key_has_a_name_that_the_cache_would_ignore() -> None:
         refuse_forbidden_keys({"adapt": {"deep": {"size": 1}}})
 
 
+def named_by(ablation: str) -> set[str]:
+    """The keys that an overlay names, with those of the overlays that it starts from."""
+    content = yaml.safe_load((CONF / "ablation" / f"{ablation}.yaml").read_text()) or {}
+    below = [name for name in content.pop("defaults", []) if name != "_self_"]
+    return {key for key, _ in leaves(content)}.union(*(named_by(name) for name in below))
+
+
+def changed_by(*overrides: str, ablation: str) -> set[str]:
+    default, changed = dict(leaves(composed(*overrides))), dict(leaves(composed(*overrides, f"ablation={ablation}")))
+    return {key for key in default.keys() | changed.keys() if default.get(key) != changed.get(key)}
+
+
+@pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("ablation", ABLATIONS)
-def test_an_ablation_changes_exactly_the_keys_it_names(ablation: str) -> None:
-    default, changed = dict(leaves(composed())), dict(leaves(composed(f"ablation={ablation}")))
-    different = {key for key in default.keys() | changed.keys() if default.get(key) != changed.get(key)}
-    named = yaml.safe_load((CONF / "ablation" / f"{ablation}.yaml").read_text()) or {}
-    assert different == {key for key, _ in leaves(named)}
-    assert bool(different) == (ablation != "none")
+def test_an_ablation_changes_exactly_the_keys_it_names(ablation: str, model: str) -> None:
+    option = f"model={model}"
+    different = changed_by(option, *NEEDED.get(option, []), ablation=ablation)
+    assert different == named_by(ablation)
+    assert bool(different) == (ablation != "default")
+
+
+@pytest.mark.parametrize("ablation", sorted(set(ABLATIONS) - {"default"}))
+def test_of_the_papers_method_an_ablation_changes_what_it_names_or_is_refused(ablation: str) -> None:
+    beyond = ablation.startswith("no_") and not {key for key in named_by(ablation) if key.startswith("adapt.")}
+    if beyond or ablation in ("paper", "spend_always"):
+        with pytest.raises(ConfigError) as caught:
+            compose(CONF, ["method=paper", f"ablation={ablation}"])
+        expected = f"ablation={ablation}: changes nothing of these settings; leave it out, or choose another method="
+        assert caught.value.line() == expected
+    else:
+        different = changed_by("method=paper", ablation=ablation)
+        assert different
+        assert different <= named_by(ablation)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("method", ["extended", "paper"])
+def test_the_model_never_decides_the_method(model: str, method: str) -> None:
+    option = f"model={model}"
+    other, mini = (
+        typed(composed(f"method={method}", option, *NEEDED.get(option, []))),
+        typed(composed(f"method={method}")),
+    )
+    assert other.corrections == mini.corrections
+    assert other.refine == mini.refine
+    assert replace(other.adapt, learning_rate=mini.adapt.learning_rate) == mini.adapt
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("ablation=none", "ablation: option 'none' has another name now; write ablation=default"),
+        ("ablation=full", "ablation: option 'full' has another name now; write ablation=paper"),
+        ("method=default", "method: option 'default' has another name now; write method=extended"),
+        ("adapt.tone=true", "adapt.tone: has another name now; write corrections.colour.match"),
+        ("adapt.close_gaps=0", "adapt.close_gaps: has another name now; write corrections.gaps.reach"),
+    ],
+)
+def test_an_old_name_says_the_new_one(override: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        compose(CONF, [override])
+    assert caught.value.line() == message
+
+
+@pytest.mark.parametrize("renamed", [*_RENAMED.values(), *("=".join((g, n)) for (g, _), n in _RENAMED_OPTIONS.items())])
+def test_new_names_are_there(renamed: str) -> None:
+    group, _, option = renamed.partition("=")
+    assert option in options_of(CONF, group) if option else renamed in known_keys(ProjectConfig)
 
 
 def test_ablations_are_different_experiments() -> None:
     seen: dict[str, str] = {}
     for ablation in ABLATIONS:
-        if ablation == "none":
+        if ablation == "default":
             continue
         content = repr(sorted(leaves(composed(f"ablation={ablation}"))))
         assert content not in seen, f"{ablation} is the same as {seen[content]}"
@@ -85,7 +157,8 @@ def test_ablations_are_different_experiments() -> None:
 
 def test_the_rows_of_the_papers_table_add_one_component_each() -> None:
     assert set(ABLATIONS) >= TABLE_ROWS
-    rows = {name: typed(composed(f"ablation={name}")).adapt for name in TABLE_ROWS}
+    methods = {name: typed(composed(f"ablation={name}")) for name in TABLE_ROWS}
+    rows = {name: method.adapt for name, method in methods.items()}
     assert rows["baseline"].steps == 0
     assert rows["anchor"].lambda_gen == 0
     assert not rows["anchor"].augment.enabled
@@ -97,26 +170,27 @@ def test_the_rows_of_the_papers_table_add_one_component_each() -> None:
     assert rows["self_distill"].insertion_probability == 0.5
     assert rows["self_distill"].restore_interval == 0
     assert rows["self_distill_p1"].insertion_probability == 1
-    assert rows["full"].restore_interval > 0
-    # The default of the embedded model is the last row, four things beyond the paper, and steps only where they can repair something.
-    beyond = {"realign": Realign.CHOOSE, "tone": True, "trust": True, "close_gaps": 0.7, "spend": Spend.WHERE_MOVED}
-    assert replace(rows["full"], **beyond) == typed(composed()).adapt
-    for row in rows.values():
-        assert (row.realign, row.splat_steps, row.inserted_weights) == ("none", 0, "uniform")
-        assert row.spend == "always" or row.steps == 0
-        assert row.alpha_gaussian == 0
-        assert not row.tone
-        assert not row.trust
-        assert row.close_gaps == 0
+    assert rows["paper"].restore_interval > 0
+    # The default is the last row, four corrections, and steps only where they can repair something.
+    assert replace(rows["paper"], spend=Spend.WHERE_MOVED) == typed(composed()).adapt
+    around = typed(composed()).corrections
+    assert (around.camera.realign, around.colour.match, around.contradiction.fade) == ("choose", True, True)
+    assert (around.gaps.reach, around.head.steps, around.others) == (0.7, 0, {})
+    for name, row in rows.items():
+        assert methods[name].corrections == CorrectionsConfig()
+        assert (row.alpha_gaussian, row.inserted_weights, row.spend) == (0, "uniform", "always")
 
 
-@pytest.mark.parametrize("model", ["mini", "worldmirror"])
+@pytest.mark.parametrize("model", MODELS)
 def test_the_papers_method_runs_all_its_steps_and_nothing_beyond(model: str) -> None:
     chosen = typed(composed("method=paper", f"model={model}", *NEEDED.get(f"model={model}", []), "profile=gpu"))
-    rate = typed(composed("ablation=full")).adapt.learning_rate if model == "mini" else 1e-5
+    rate = typed(composed("ablation=paper")).adapt.learning_rate if model == "mini" else 1e-5
     assert chosen.adapt == replace(AdaptConfig(), learning_rate=rate)
     assert chosen.refine.visits == 0
-    assert typed(composed("method=paper")).adapt == typed(composed("ablation=full")).adapt
+    assert chosen.corrections == CorrectionsConfig()
+    assert composed("method=paper") == composed("ablation=paper", "refine.visits=0"), (
+        "as the study of predictions has it"
+    )
 
 
 def test_the_controls_take_away_what_they_say() -> None:
@@ -131,7 +205,7 @@ def test_the_controls_take_away_what_they_say() -> None:
 
 
 def test_the_gpu_profile_with_worldmirror_has_the_papers_values() -> None:
-    config = typed(composed("profile=gpu", "model=worldmirror", "model.weights=x.safetensors"))
+    config = typed(composed("profile=gpu", "method=paper", "model=worldmirror", "model.weights=x.safetensors"))
     paper = AdaptConfig()  # its defaults are the paper's, and are tested as such where they live
     assert config.adapt == paper
     assert config.device == "cuda"
@@ -225,10 +299,10 @@ def test_an_optional_group_may_be_asked_for_nothing() -> None:
 
 
 def test_whole_numbers_may_be_written_as_powers_of_ten() -> None:
-    values = composed("adapt.steps=1e2", "adapt.close_gaps=1")
-    assert (values["adapt"]["steps"], values["adapt"]["close_gaps"]) == (100, 1.0)
+    values = composed("adapt.steps=1e2", "adapt.weight_decay=1")
+    assert (values["adapt"]["steps"], values["adapt"]["weight_decay"]) == (100, 1.0)
     # As it is kept, too: one value has one key in the cache.
-    assert [type(values["adapt"][name]) for name in ("steps", "close_gaps")] == [int, float]
+    assert [type(values["adapt"][name]) for name in ("steps", "weight_decay")] == [int, float]
 
 
 @pytest.mark.parametrize("text", ["a: [", "\x00", "a: 1\n b: 2", "- 1", "3", "a: {b: !!python/name:os.system }"])

@@ -11,7 +11,9 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.inference.config import RivalConfig, RivalsConfig
 from sceneexpander.ingest import IngestConfig
-from sceneexpander.optimisation.config import OptimiseConfig, RefineConfig
+from sceneexpander.insertion.config import CorrectionsConfig
+from sceneexpander.optimisation.config import OptimiseConfig
+from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.rendering import RenderConfig
 
 CONF = Path(__file__).parents[3] / "conf"
@@ -22,6 +24,7 @@ CONF = Path(__file__).parents[3] / "conf"
     [
         ("frontend", FrontendConfig()),
         ("adapt", AdaptConfig()),
+        ("corrections", CorrectionsConfig()),
         ("evaluate", EvaluateConfig()),
         ("scene", IngestConfig()),
         ("optimise", OptimiseConfig()),

@@ -75,7 +75,7 @@ def filled(path: str) -> str:
             ],
         ),
         ("prepare", [layout.prepared("S"), layout.statistics("prepare", "S")]),
-        ("reconstruct", [layout.state("S", 0), layout.statistics("reconstruct", "S")]),
+        ("reconstruct", [layout.state("S", 0), layout.match_memory("S"), layout.statistics("reconstruct", "S")]),
         ("generate_view", [layout.candidates("S", 2), layout.statistics("generate_view", "S", 2)]),
         ("choose_view", [layout.inserted("S", 2), layout.statistics("choose_view", "S", 2)]),
         (

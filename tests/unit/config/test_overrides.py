@@ -131,7 +131,7 @@ def test_a_list_of_files_stays_a_sweep() -> None:
 
 def test_text_keys_are_texts() -> None:
     assert {"model.weights", "generator.file", "tracking.experiment"} <= text_keys()
-    assert not {"seed", "adapt.steps", "scene.fit", "adapt.realign"} & text_keys()
+    assert not {"seed", "adapt.steps", "scene.fit", "corrections.camera.realign"} & text_keys()
 
 
 def test_the_home_of_nobody_is_one_line() -> None:

@@ -81,7 +81,7 @@ def test_a_table_of_ones_own_touches_neither(
     project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (project / "docs" / "ablation.md").read_text()
-    command(monkeypatch, ["--rows", "none", "--scenes", "test", "--seeds", "0"])
+    command(monkeypatch, ["--rows", "default", "--scenes", "test", "--seeds", "0"])
     shown = capsys.readouterr().out
     assert "8 test scenes" in shown
     assert "| none | 8 | 30.00 |" in shown
@@ -93,9 +93,11 @@ def test_a_table_of_ones_own_touches_neither(
     ("given", "said"),
     [
         (["--study", "row"], "did you mean 'rows'"),
-        (["--study", "rows", "--rows", "full"], "--study"),
+        (["--study", "rows", "--rows", "paper"], "--study"),
         (["adapt.steps=3"], "would change every study"),
-        (["--rows", "control_no_adaptation"], "'corrected'"),
+        (["--rows", "control_no_adaptation"], "ablation=corrected"),
+        (["--rows", "full"], "ablation=paper"),
+        (["--rows", "free_cameras"], "row 'free_cameras' changes what all rows of a table share"),
     ],
 )
 def test_what_cannot_be_meant_is_one_line(

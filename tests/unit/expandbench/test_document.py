@@ -16,20 +16,22 @@ from sceneexpander.expandbench.grades import GRADES
 from sceneexpander.expandbench.run import BASELINE, CAPTURED
 from sceneexpander.expandbench.scenes import DEVELOPMENT, SCENES, TEST
 from sceneexpander.expandbench.studies import STUDIES
+from sceneexpander.insertion.contradiction import Contradiction
+from tests.support.methods import make_method
 from tests.unit.expandbench.test_table import cell
 
 ROOT = Path(__file__).parents[3]
 PAGE, FILE = ROOT / "docs" / "ablation.md", ROOT / "results" / "ablation.json"
 ROWS = {
-    "self_distill": AdaptConfig(steps=30, restore_interval=0),
-    "full": AdaptConfig(steps=30),
-    "corrected": AdaptConfig(steps=0, trust=True),
-    "none": AdaptConfig(steps=30, trust=True),
+    "self_distill": make_method(AdaptConfig(steps=30, restore_interval=0)),
+    "paper": make_method(AdaptConfig(steps=30)),
+    "corrected": make_method(AdaptConfig(steps=0), contradiction=Contradiction(fade=True)),
+    "default": make_method(AdaptConfig(steps=30), contradiction=Contradiction(fade=True)),
 }
 
 
 def results() -> Results:
-    values = {CAPTURED: 30.0, BASELINE: 28.0, "self_distill": 27.9, "full": 27.9, "corrected": 29.5, "none": 29.25}
+    values = {CAPTURED: 30.0, BASELINE: 28.0, "self_distill": 27.9, "paper": 27.9, "corrected": 29.5, "default": 29.25}
     cells = [
         cell("room_1", row, value + seed / 10, seed=seed, grade="" if row == CAPTURED else "mixed_2")
         for row, value in values.items()
@@ -78,11 +80,14 @@ def test_the_gain_is_split_into_corrections_and_adaptation() -> None:
 
 
 def test_a_row_without_power_is_no_tie() -> None:
-    assert set(powerless(ROWS)) == {"full"}
-    (line,) = [line for line in document(results()).splitlines() if line.startswith("| full | self_distill |")]
+    assert set(powerless(ROWS)) == {"paper"}
+    (line,) = [line for line in document(results()).splitlines() if line.startswith("| paper | self_distill |")]
     assert "no power at 30 steps" in line
     assert "+0.00" not in line
-    longer = {name: replace(row, steps=400) if row.steps else row for name, row in ROWS.items()}
+    longer = {
+        name: replace(row, adapt=replace(row.adapt, steps=400)) if row.adapt.steps else row
+        for name, row in ROWS.items()
+    }
     assert powerless(longer) == {}
 
 
@@ -104,7 +109,7 @@ def test_rows_that_cannot_show_anything_in_few_steps_are_studied_with_many() -> 
         mute = set(powerless(plan.rows))
         for row in study.rows:
             shown.setdefault(row, set()).add("mute" if row in mute else "heard")
-    assert "mute" in shown["full"], "restoration cannot show in 30 steps"
+    assert "mute" in shown["paper"], "restoration cannot show in 30 steps"
     assert [row for row, seen in shown.items() if seen == {"mute"}] == []
 
 
@@ -118,7 +123,7 @@ def test_test_scenes_are_others_and_only_the_study_of_that_name_uses_them() -> N
 
 
 def test_an_old_name_says_the_new_one() -> None:
-    with pytest.raises(UserError, match="'corrected'"):
+    with pytest.raises(UserError, match="ablation=corrected"):
         make_plan(ROOT, ["control_no_adaptation"], ["room_1"], ["clean"], ["0"], [])
-    plan, _ = make_plan(ROOT, ["none"], ["test"], ["clean"], ["0"], [])
+    plan, _ = make_plan(ROOT, ["default"], ["test"], ["clean"], ["0"], [])
     assert plan.scenes == TEST

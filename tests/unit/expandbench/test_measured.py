@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 import torch
 
-from sceneexpander.adaptation.consistency import pixel_trust
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.artifacts.state import save_priors
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.compose import compose
-from sceneexpander.config.parse import parse_dataclass
+from sceneexpander.config.files import write_yaml
+from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.expandbench import run as bench
 from sceneexpander.expandbench import scenes
@@ -21,10 +23,15 @@ from sceneexpander.expandbench.grades import grade_named
 from sceneexpander.expandbench.prepared import PreparedScene, prepare_case, prepare_scene
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, Settings
 from sceneexpander.expandbench.scenes import BenchScene
-from sceneexpander.expansion import adapt_round, correct_round, refined, refined_round
+from sceneexpander.expansion import MethodConfig, compose_procedure
 from sceneexpander.geometry.rigid import rotation_angle_deg
-from sceneexpander.optimisation.config import RefineConfig
-from sceneexpander.reconstruction import fitting
+from sceneexpander.insertion.config import ENTRY_POINTS
+from sceneexpander.insertion.contradiction import pixel_trust
+from sceneexpander.packages import LOCKS
+from sceneexpander.photometric import fitting
+from sceneexpander.photometric.config import RefineConfig
+from sceneexpander.splatting.kernel_backend import kernel_build
+from stages import adapt, correct, layout
 
 ROOT = Path(__file__).parents[3]
 GRADE = "mixed_2"
@@ -37,10 +44,15 @@ def config(row: str) -> ProjectConfig:
     return parse_dataclass(ProjectConfig, values)
 
 
+def method(row: str) -> MethodConfig:
+    chosen = config(row)
+    return MethodConfig(adapt=chosen.adapt, corrections=chosen.corrections)
+
+
 @pytest.fixture(scope="module")
 def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[bench._Worker]:
     """A scene's worker at a quarter of the benchmark's pixels, with its case prepared."""
-    shared = config("none")
+    shared = config("default")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scenes, "HEIGHT", 84)
         patch.setattr(scenes, "WIDTH", 112)
@@ -64,8 +76,7 @@ def kept(worker: bench._Worker, monkeypatch: pytest.MonkeyPatch, grade: str, row
         seen.append(reconstruction)
 
     monkeypatch.setattr(bench._Worker, "_numbers", numbers)
-    adapt = None if row in (CAPTURED, BASELINE) else config(row).adapt
-    worker._measured(grade, row, seed, adapt)
+    worker._measured(grade, row, seed, None if row in (CAPTURED, BASELINE) else method(row))
     return seen[-1]
 
 
@@ -81,19 +92,77 @@ def test_a_row_is_what_the_pipeline_makes_of_the_same_inputs(
 ) -> None:
     """As the stages adapt and correct do it: the fit with the doubts that the row asks for, at the row's seed."""
     inputs, fit = worker.case(GRADE).inputs, worker.settings.refine
-    adapt = config("none").adapt
-    assert adapt.trust
-    state, reconstruction, _ = adapt_round(inputs, worker.loaded, adapt, seed=1)
-    wanted, _ = refined_round(reconstruction, state, adapt, fit, seed=1)
-    found = kept(worker, monkeypatch, GRADE, "none", 1)
-    assert same(found, wanted)
-    trustful, _ = refined(reconstruction, state.toned_views, fit, doubt_generated=False, seed=1)
+    procedure = compose_procedure(method("default"), fit)
+    assert procedure.doubted
+    found = kept(worker, monkeypatch, GRADE, "default", 1)
+    assert same(found, procedure.run(inputs, worker.loaded, seed=1).scene)
+    trustful = replace(procedure, doubted=False).run(inputs, worker.loaded, seed=1).scene
     assert not same(found, trustful), "doubt changes something here"
-    assert not same(found, kept(worker, monkeypatch, GRADE, "none", 2)), "the seed is the fit's, too"
+    assert not same(found, kept(worker, monkeypatch, GRADE, "default", 2)), "the seed is the fit's, too"
 
-    state, reconstruction, _ = correct_round(inputs, worker.loaded, adapt, seed=1)
-    wanted, _ = refined_round(reconstruction, state, adapt, fit, seed=1)
+    wanted = procedure.without_steps().run(inputs, worker.loaded, seed=1).scene
     assert same(kept(worker, monkeypatch, GRADE, "corrected", 1), wanted)
+
+
+TOY = """
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dim:
+    share: float = 1.0
+
+    def correct_scene(self, scene, inputs, context):
+        gaussians = scene.gaussians
+        return replace(scene, gaussians=replace(gaussians, opacities=gaussians.opacities * self.share))
+"""
+
+
+def test_a_correction_of_another_package_runs_in_stages_and_benchmark(
+    worker: bench._Worker, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Installed with an entry point and given settings: nothing of this package names it."""
+    packages = tmp_path / "packages"
+    (packages / "toy-1.0.dist-info").mkdir(parents=True)
+    (packages / "toy.py").write_text(TOY)
+    (packages / "toy-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: toy\nVersion: 1.0\n")
+    (packages / "toy-1.0.dist-info" / "entry_points.txt").write_text(f"[{ENTRY_POINTS}]\ndim = toy:Dim\n")
+    monkeypatch.syspath_prepend(str(packages))
+    overrides = ["+corrections.others.dim.share=0.5", "refine.visits=0", "adapt.steps=0", "threads=1"]
+    values = compose(ROOT / "conf", ["experiment=expandbench", *overrides])
+    chosen = parse_dataclass(ProjectConfig, values)
+    with pytest.raises(ConfigError, match="did you mean 'dim'"):
+        compose(ROOT / "conf", ["+corrections.others.dimm.share=0.5"])
+    with pytest.raises(ConfigError, match="share"):
+        compose(ROOT / "conf", ["+corrections.others.dim.share=half"])
+
+    monkeypatch.setattr(worker, "settings", replace(worker.settings, refine=chosen.refine))
+    plain = MethodConfig(adapt=chosen.adapt, corrections=replace(chosen.corrections, others={}))
+    measured: list[Reconstruction] = []
+    monkeypatch.setattr(bench._Worker, "_numbers", lambda _, scene, case: measured.append(scene))
+    for row in (plain, MethodConfig(adapt=chosen.adapt, corrections=chosen.corrections)):
+        worker._measured(GRADE, "toy", chosen.seed, row)
+    without, found = measured[0], measured[2]  # between them: the same weights alone
+    torch.testing.assert_close(found.gaussians.opacities, 0.5 * without.gaussians.opacities)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DVC_STAGE", raising=False)
+    inputs = worker.case(GRADE).inputs
+    inputs.state.save(layout.state("s", 0))
+    inputs.inserted.save(layout.inserted("s", 1))
+    inputs.anchors.save(layout.anchors("s", 1))
+    save_priors(layout.joint_priors("s", 1), inputs.joint_priors)
+    write_yaml(layout.config("s"), values)
+    write_json_atomic(layout.ENVIRONMENT, {"kernel": kernel_build()})
+    for lock in LOCKS:
+        (tmp_path / lock).symlink_to(ROOT / lock)
+    write_json_atomic(layout.CODE, {"adapt": "0" * 64, "correct": "0" * 64})
+    write_yaml(layout.selection("s"), {"corrected": True})
+    for stage, method in ((adapt, "sceneexpander"), (correct, "corrected")):
+        more = [method] if stage is correct else []
+        monkeypatch.setattr("sys.argv", [stage.__name__, "s", "1", "0", *more])
+        stage.main()
+        assert same(Reconstruction.load(layout.reconstruction("s", 1, method)), found), stage.__name__
 
 
 @pytest.mark.parametrize("row", [CAPTURED, BASELINE])
@@ -107,7 +176,7 @@ def test_fixed_rows_are_fitted_with_the_seed_of_their_pair_and_doubt_nothing(
     if row == BASELINE:
         views, start = views.append(inputs.inserted.view), worker.case(GRADE).backbone
     for seed, reconstruction in found.items():
-        wanted, _ = refined(start, views, fit, doubt_generated=False, seed=seed)
+        wanted, _ = fitting.fit_to_views(start, views, fit, seed=seed)
         assert same(reconstruction, wanted)
     assert not same(found[0], found[3])
     assert not same(found[0], start), "a fit, and a kept one"

@@ -7,18 +7,18 @@ from pathlib import Path
 import pytest
 
 from sceneexpander.adaptation.config import AdaptConfig
-from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.expandbench import run as bench
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings, run
-from sceneexpander.expansion import ModelConfig
+from sceneexpander.expansion import MethodConfig, ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
-from sceneexpander.optimisation.config import RefineConfig
+from sceneexpander.photometric.config import RefineConfig, WarmupConfig
+from tests.support.methods import make_method
 from tests.unit.expandbench.test_table import NUMBERS
 
 PLAN = Plan(
     scenes=("room_1", "open_1"),
     grades=("mixed_1", "warp_1"),
-    rows={"full": AdaptConfig(steps=3), "anchor": AdaptConfig(steps=3, lambda_gen=0)},
+    rows={"paper": make_method(AdaptConfig(steps=3)), "anchor": make_method(AdaptConfig(steps=3, lambda_gen=0))},
     seeds=(0, 1),
 )
 
@@ -29,7 +29,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     calls: list[tuple[str, ...]] = []
 
     def fake(
-        self: bench._Worker, grade: str, row: str, seed: int, config: AdaptConfig | None, checkpoints: Path
+        self: bench._Worker, grade: str, row: str, seed: int, config: MethodConfig | None, checkpoints: Path
     ) -> CellResult:
         calls.append((self.name, grade, row, str(seed)))
         alone = None if config is None else NUMBERS
@@ -52,7 +52,7 @@ def test_every_cell_once(tmp_path: Path, measured: list[tuple[str, ...]]) -> Non
     cells = run(PLAN, settings(tmp_path), on_cell=seen.append)
     assert len(cells) == len(PLAN) == len(measured) == 2 * 2 * (1 + 2 * (1 + 2))
     assert seen == cells
-    assert {cell.row for cell in cells} == {CAPTURED, BASELINE, "full", "anchor"}
+    assert {cell.row for cell in cells} == {CAPTURED, BASELINE, "paper", "anchor"}
     again = run(PLAN, settings(tmp_path))
     assert again == cells
     assert len(measured) == len(PLAN)
@@ -89,13 +89,15 @@ def test_other_code_or_settings_are_measured_again(tmp_path: Path, measured: lis
 def test_a_changed_row_is_measured_again_and_a_renamed_one_is_not(
     tmp_path: Path, measured: list[tuple[str, ...]]
 ) -> None:
-    plan = Plan(scenes=("room_1",), grades=("mixed_1",), rows={"full": AdaptConfig(steps=3)}, seeds=(0,))
+    plan = Plan(scenes=("room_1",), grades=("mixed_1",), rows={"paper": make_method(AdaptConfig(steps=3))}, seeds=(0,))
     run(plan, settings(tmp_path))
     count = len(measured)
-    renamed = Plan(scenes=plan.scenes, grades=plan.grades, rows={"mine": AdaptConfig(steps=3)}, seeds=(0,))
+    renamed = Plan(scenes=plan.scenes, grades=plan.grades, rows={"mine": make_method(AdaptConfig(steps=3))}, seeds=(0,))
     assert [cell.row for cell in run(renamed, settings(tmp_path))] == [CAPTURED, BASELINE, "mine"]
     assert len(measured) == count
-    changed = Plan(scenes=plan.scenes, grades=plan.grades, rows={"full": AdaptConfig(steps=4)}, seeds=(0,))
+    changed = Plan(
+        scenes=plan.scenes, grades=plan.grades, rows={"paper": make_method(AdaptConfig(steps=4))}, seeds=(0,)
+    )
     run(changed, settings(tmp_path))
     assert len(measured) == count + 1
 

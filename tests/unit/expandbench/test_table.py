@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.expandbench.measure import BenchNumbers
 from sceneexpander.expandbench.plot import curve, plot
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
@@ -23,6 +22,7 @@ from sceneexpander.expandbench.table import (
     scenes_table,
     seed_spread,
 )
+from sceneexpander.insertion.acceptance import Acceptance
 
 PSNR = next(column for column in COLUMNS if column.name == "psnr_captured_db")
 DEPTH = next(column for column in COLUMNS if column.name == "depth_abs_rel")
@@ -54,21 +54,21 @@ CELLS = [
     cell("b", CAPTURED, 23.0, grade=""),
     cell("a", BASELINE, 20.0),
     cell("b", BASELINE, 22.0),
-    cell("a", "full", 21.0, seed=0, depth=0.04),
-    cell("b", "full", 21.9, seed=0, depth=0.06),
-    cell("a", "full", 22.0, seed=1, depth=0.04),
-    cell("b", "full", 21.9, seed=1, depth=0.06),
+    cell("a", "paper", 21.0, seed=0, depth=0.04),
+    cell("b", "paper", 21.9, seed=0, depth=0.06),
+    cell("a", "paper", 22.0, seed=1, depth=0.04),
+    cell("b", "paper", 21.9, seed=1, depth=0.06),
     *(cell(scene, CAPTURED, value, seed=1, grade="") for scene, value in (("a", 21.2), ("b", 23.2))),
     *(cell(scene, BASELINE, value, seed=1) for scene, value in (("a", 20.4), ("b", 22.4))),
 ]
 
 
 def test_rows_start_with_the_fixed_ones() -> None:
-    assert row_names(CELLS[::-1]) == [CAPTURED, BASELINE, "full"]
+    assert row_names(CELLS[::-1]) == [CAPTURED, BASELINE, "paper"]
 
 
 def test_means_and_spread_over_seeds() -> None:
-    own = [c for c in CELLS if c.row == "full"]
+    own = [c for c in CELLS if c.row == "paper"]
     assert mean_of(own, PSNR) == pytest.approx((21 + 21.9 + 22 + 21.9) / 4)
     # Per seed: 21.45 and 21.95.
     assert seed_spread(own, PSNR) == pytest.approx(0.5 / 2**0.5)
@@ -83,18 +83,18 @@ def test_a_mean_with_a_gap_is_no_mean() -> None:
 
 
 def test_differences_are_paired_by_scene_and_grade() -> None:
-    found = paired(CELLS, "full", PSNR)
+    found = paired(CELLS, "paper", PSNR)
     assert found is not None
     # Scene a: 21 - 20 and 22 - 20.4, scene b: 21.9 - 22 and 21.9 - 22.4: each with the baseline of its own seed.
     assert found.mean == pytest.approx((1.3 - 0.3) / 2)
     assert found.lowest == pytest.approx(-0.3)
     assert (found.better, found.scenes) == (1, 2)
     assert found.seed_spread == pytest.approx(abs((1 - 0.1) / 2 - (1.6 - 0.5) / 2) / 2**0.5)
-    assert paired([c for c in CELLS if c.row != BASELINE or c.seed == 0], "full", PSNR) == paired(
-        CELLS[:6], "full", PSNR
+    assert paired([c for c in CELLS if c.row != BASELINE or c.seed == 0], "paper", PSNR) == paired(
+        CELLS[:6], "paper", PSNR
     )
-    assert paired(CELLS[:4], "full", PSNR) is None
-    assert paired([c for c in CELLS if c.row != BASELINE], "full", PSNR) is None
+    assert paired(CELLS[:4], "paper", PSNR) is None
+    assert paired([c for c in CELLS if c.row != BASELINE], "paper", PSNR) is None
 
 
 def test_a_component_is_compared_with_the_row_that_lacks_it_unless_it_cannot_show() -> None:
@@ -107,39 +107,39 @@ def test_a_component_is_compared_with_the_row_that_lacks_it_unless_it_cannot_sho
             for c in CELLS[4:8]
         ),
     ]
-    references = {"full": BASELINE, "more": "full", "absent": "full"}
+    references = {"paper": BASELINE, "more": "paper", "absent": "paper"}
     lines = components_table(cells, references, {}, [PSNR]).splitlines()
-    assert lines[3] == "| more | full | +0.30 ± 0.00 (worst +0.30; 2/2) |"
+    assert lines[3] == "| more | paper | +0.30 ± 0.00 (worst +0.30; 2/2) |"
     assert len(lines) == 4
     mute = components_table(cells, references, {"more": "no power at 30 steps: it touches nothing"}, [PSNR, DEPTH])
-    assert mute.splitlines()[3] == "| more | full | no power at 30 steps: it touches nothing | – |"
+    assert mute.splitlines()[3] == "| more | paper | no power at 30 steps: it touches nothing | – |"
 
 
 def test_scene_by_scene() -> None:
-    assert scenes_table(CELLS, ["full"]).splitlines()[2:] == [
+    assert scenes_table(CELLS, ["paper"]).splitlines()[2:] == [
         "| before | 21.10 | 23.10 |",
         "| baseline | -0.90 | -0.90 |",
-        "| full | +1.30 | -0.30 |",
+        "| paper | +1.30 | -0.30 |",
     ]
 
 
 def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
-    found = paired(CELLS, "full", DEPTH)
+    found = paired(CELLS, "paper", DEPTH)
     assert found is not None
     assert found.mean == pytest.approx(0.0)
     assert found.lowest == pytest.approx(0.01)
     assert found.better == 1
-    smaller = [replace(c, numbers=changed(c.numbers, depth_abs_rel=0.03)) if c.row == "full" else c for c in CELLS]
-    found = paired(smaller, "full", DEPTH)
+    smaller = [replace(c, numbers=changed(c.numbers, depth_abs_rel=0.03)) if c.row == "paper" else c for c in CELLS]
+    found = paired(smaller, "paper", DEPTH)
     assert found is not None
     assert (found.better, found.scenes) == (2, 2)
 
 
 def test_the_tables_say_so() -> None:
     text = main_table(CELLS)
-    assert "| full | 4 | 21.70 ± 0.35 | 0.0 ± 0.0 | 21.70 ± 0.35 |" in text
+    assert "| paper | 4 | 21.70 ± 0.35 | 0.0 ± 0.0 | 21.70 ± 0.35 |" in text
     assert "| captured | 4 | 22.10 ± 0.14 | 0.0 ± 0.0 | 22.10 ± 0.14 |" in text
-    curve = curve_table(CELLS, ["full"])
+    curve = curve_table(CELLS, ["paper"])
     assert "| mixed_1 | -0.90 ± 0.14 (worst -0.90; 0/2) | +0.50 ± 0.07 (worst -0.30; 1/2) |" in curve
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sceneexpander.adaptation.config import AdaptConfig, Realign, Spend
-from sceneexpander.adaptation.corrections import Estimate
+from sceneexpander.adaptation.config import AdaptConfig, Spend
 from sceneexpander.adaptation.loop import AdaptationInputs
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.reconstruction import Reconstruction
@@ -18,25 +17,30 @@ from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.expansion import (
     LoadedModel,
     RoundInputs,
-    adapt_round,
     captured_prediction,
-    correct_round,
     joint_reconstruction,
     judge_round,
-    refined,
-    refined_round,
 )
-from sceneexpander.expansion import rounds as rounds_module
-from sceneexpander.expansion.rounds import aligned, realigned_priors, reconstruct
+from sceneexpander.expansion import procedure as procedure_module
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.gaussians import rgb_from_sh
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
-from sceneexpander.optimisation.config import RefineConfig
-from sceneexpander.reconstruction import fitting as fitting_module
+from sceneexpander.insertion import camera as camera_module
+from sceneexpander.insertion.camera import realign_priors
+from sceneexpander.insertion.colour import Colour
+from sceneexpander.insertion.contradiction import Contradiction, pixel_trust
+from sceneexpander.insertion.gap_filling import GapFilling
+from sceneexpander.insertion.head import GaussianHead
+from sceneexpander.insertion.realign import Realign
+from sceneexpander.insertion.report import Estimate
+from sceneexpander.photometric import fitting as fitting_module
+from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.reconstruction import views as views_module
+from sceneexpander.reconstruction.views import reconstruct
 from sceneexpander.synthetic import make_views
 from tests.support.gauged_model import GaugedReconstructor
-from tests.unit.expansion.test_choose import view_set
+from tests.support.methods import make_procedure
+from tests.unit.insertion.test_camera import view_set
 
 VIEWS, H, W = 3, 84, 112
 BRIGHT = 1.25
@@ -103,14 +107,15 @@ def test_tone_decides_which_picture_is_adapted_to(
 ) -> None:
     loaded, taken = loaded_model(), []
     inputs = start(truth, loaded)
-    original: Callable[..., object] = rounds_module.adapt
+    original: Callable[..., object] = procedure_module.adapt
 
     def spy(model: object, given: AdaptationInputs, *more: object, **named: object) -> object:
         taken.append(given.inserted)
         return original(model, given, *more, **named)
 
-    monkeypatch.setattr(rounds_module, "adapt", spy)
-    state, reconstruction, result = adapt_round(inputs, loaded, replace(PLAIN, tone=tone), seed=0)
+    monkeypatch.setattr(procedure_module, "adapt", spy)
+    made = make_procedure(PLAIN, colour=Colour(match=tone)).run(inputs, loaded, seed=0)
+    state, reconstruction = made.state, made.scene
     given = inputs.inserted.view.images[0]
     seen = (given > 0.2) & (given < 0.85)
     ratio = float((taken[0] / given)[seen].median())
@@ -123,8 +128,7 @@ def test_tone_decides_which_picture_is_adapted_to(
     assert torch.equal(state.views.images[VIEWS], given)
     assert state.views.records[VIEWS] == inputs.inserted.view.records[0]
     assert (state.toned is not None) == tone
-    assert result.corrections is not None
-    assert (result.corrections.gains is not None) == tone
+    assert (made.corrections.gains is not None) == tone
     hashes = {state.views.records[VIEWS].sha256, state.toned_views.records[VIEWS].sha256}
     assert len(hashes) == 1 + tone, "a hash belongs to one picture"
     assert state.toned_views.records[:VIEWS] == state.views.records[:VIEWS]
@@ -134,17 +138,17 @@ def test_a_view_without_a_camera_keeps_its_tone(truth: tuple[torch.Tensor, Prior
     loaded = loaded_model()
     inputs = start(truth, loaded)
     lost = replace(truth[1], posed=torch.tensor([True] * VIEWS + [False]))
-    found = aligned(replace(inputs, joint_priors=lost), loaded, replace(STILL, tone=True), seed=0)
+    procedure = make_procedure(STILL, colour=Colour(match=True))
+    found = procedure.correct_inputs(replace(inputs, joint_priors=lost), loaded, seed=0)
     assert found.toned is None
-    assert found.corrections.gains is None
+    assert found.report.gains is None
 
 
 @pytest.mark.parametrize("trust", [False, True])
 def test_trust_fades_what_the_photos_contradict(truth: tuple[torch.Tensor, Priors], trust: bool) -> None:
     loaded = loaded_model()
-    _, reconstruction, _ = adapt_round(
-        start(truth, loaded, paint=True), loaded, replace(STILL, tone=True, trust=trust), seed=0
-    )
+    procedure = make_procedure(STILL, colour=Colour(match=True), contradiction=Contradiction(fade=trust))
+    reconstruction = procedure.run(start(truth, loaded, paint=True), loaded, seed=0).scene
     kept = (new_gaussians(reconstruction, "opacities") / 0.9).view(H, W)
     assert torch.allclose(reconstruction.gaussians.opacities[~reconstruction.gaussians.generated], torch.tensor(0.9))
     assert (float(kept[PAINTED].mean()) < 0.6) == trust
@@ -156,7 +160,7 @@ def test_close_gaps_widens_gaussians_of_new_space(truth: tuple[torch.Tensor, Pri
     loaded = loaded_model()
     inputs = start(truth, loaded)
     plain = reconstruct(inputs.views, inputs.joint_priors, loaded, inputs.state.weights, method="plain")
-    _, made, _ = adapt_round(inputs, loaded, replace(STILL, close_gaps=reach), seed=0)
+    made = make_procedure(STILL, gaps=GapFilling(reach=reach)).run(inputs, loaded, seed=0).scene
     wider = new_gaussians(made, "scales").amax(1) > 1.01 * new_gaussians(plain, "scales").amax(1)
     assert (int(wider.sum()) > 100) == (reach > 0.6)
     old = ~made.gaussians.generated
@@ -166,7 +170,7 @@ def test_close_gaps_widens_gaussians_of_new_space(truth: tuple[torch.Tensor, Pri
 def test_without_corrections_and_steps_the_round_is_the_unadapted_model(truth: tuple[torch.Tensor, Priors]) -> None:
     loaded = loaded_model()
     inputs = start(truth, loaded, paint=True)
-    _, made, _ = adapt_round(inputs, loaded, STILL, seed=0)
+    made = make_procedure(STILL).run(inputs, loaded, seed=0).scene
     plain = reconstruct(inputs.views, inputs.joint_priors, loaded, inputs.state.weights, method="plain")
     for part in fields(plain.gaussians):
         a, b = (getattr(own.gaussians, part.name) for own in (made, plain))
@@ -176,13 +180,21 @@ def test_without_corrections_and_steps_the_round_is_the_unadapted_model(truth: t
 def test_corrections_alone_are_the_round_without_a_step(truth: tuple[torch.Tensor, Priors]) -> None:
     loaded = loaded_model()
     inputs = start(truth, loaded, paint=True)
-    config = replace(PLAIN, steps=6, learning_rate=1e-2, tone=True, trust=True, close_gaps=0.7, splat_steps=2)
-    state, made, corrections = correct_round(inputs, loaded, config, seed=0)
-    still, same, result = adapt_round(inputs, loaded, replace(config, steps=0, splat_steps=0), seed=0)
-    _, adapted, _ = adapt_round(inputs, loaded, replace(config, splat_steps=0), seed=0)
+    config = replace(PLAIN, steps=6, learning_rate=1e-2)
+    around = {
+        "colour": Colour(match=True),
+        "gaps": GapFilling(reach=0.7),
+        "contradiction": Contradiction(fade=True),
+    }
+    whole = make_procedure(config, head=GaussianHead(steps=2), **around)
+    corrected = whole.without_steps().run(inputs, loaded, seed=0)
+    state, made = corrected.state, corrected.scene
+    unmoved = make_procedure(replace(config, steps=0), **around).run(inputs, loaded, seed=0)
+    still, same = unmoved.state, unmoved.scene
+    adapted = make_procedure(config, **around).run(inputs, loaded, seed=0).scene
     assert made.method == "corrected"
-    assert corrections == result.corrections
-    assert corrections.gains is not None
+    assert corrected.corrections == unmoved.corrections
+    assert corrected.corrections.gains is not None
     for part in fields(made.gaussians):
         a, b = (getattr(own.gaussians, part.name) for own in (made, same))
         assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
@@ -194,7 +206,8 @@ def test_corrections_alone_are_the_round_without_a_step(truth: tuple[torch.Tenso
 def test_the_next_round_starts_from_the_weights_of_the_last(truth: tuple[torch.Tensor, Priors]) -> None:
     loaded = loaded_model()
     strong = replace(PLAIN, steps=8, learning_rate=1e-2, insertion_probability=1.0)
-    first, made, _ = adapt_round(start(truth, loaded), loaded, strong, seed=0)
+    round_one = make_procedure(strong).run(start(truth, loaded), loaded, seed=0)
+    first, made = round_one.state, round_one.scene
     assert first.weights.change
     anchors, before = captured_prediction(first, loaded)
     torch.testing.assert_close(before.depth, made.depth)
@@ -202,7 +215,7 @@ def test_the_next_round_starts_from_the_weights_of_the_last(truth: tuple[torch.T
     joint = priors.select([*range(VIEWS + 1), 1])
     second = RoundInputs(state=first, inserted=inserted_view(truth[0][1], 2), anchors=anchors, joint_priors=joint)
     hardly = replace(PLAIN, steps=1, learning_rate=1e-12, restore_interval=0)
-    after, _, _ = adapt_round(second, loaded, hardly, seed=0)
+    after = make_procedure(hardly).run(second, loaded, seed=0).state
     start_of_second, end = first.weights.applied_to(loaded.base), after.weights.applied_to(loaded.base)
     for name, value in end.items():
         torch.testing.assert_close(value, start_of_second[name], atol=1e-7, rtol=0)
@@ -214,9 +227,9 @@ def test_in_every_round_others_see_the_given_pictures_and_the_baseline_is_unadap
     truth: tuple[torch.Tensor, Priors], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     loaded = loaded_model()
-    config = replace(PLAIN, steps=8, learning_rate=1e-2, tone=True)
+    procedure = make_procedure(replace(PLAIN, steps=8, learning_rate=1e-2), colour=Colour(match=True))
     inputs = start(truth, loaded)
-    first, _, _ = adapt_round(inputs, loaded, config, seed=0)
+    first = procedure.run(inputs, loaded, seed=0).state
     first.save(tmp_path / "state")
     state = ExpansionState.load(tmp_path / "state")
     assert state.toned is not None
@@ -256,25 +269,13 @@ def test_the_joint_estimate_comes_in_the_gauge_of_what_was_known(
     torch.testing.assert_close(baseline.depth[:VIEWS], inputs.anchors.depth, rtol=1e-5, atol=0)
 
 
-def test_a_baseline_treats_the_inserted_view_like_any_other(
-    truth: tuple[torch.Tensor, Priors], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photos_are_never_doubted(truth: tuple[torch.Tensor, Priors]) -> None:
     loaded = loaded_model()
     inputs = start(truth, loaded, paint=True)
     made = reconstruct(inputs.views, inputs.joint_priors, loaded, inputs.state.weights, method="backbone")
-    told: list[torch.Tensor | None] = []
-
-    def spy(start: Reconstruction, images: torch.Tensor, config: RefineConfig, **more: torch.Tensor | None) -> object:
-        told.append(more["weights"])
-        return start, None
-
-    monkeypatch.setattr(fitting_module, "refine", spy)
-    for doubt in (False, True):
-        refined(made, inputs.views, RefineConfig(visits=1), doubt_generated=doubt, seed=0)
-    assert told[0] is None, "every pixel of every picture counts"
-    assert told[1] is not None
-    assert bool((told[1][:VIEWS] == 1).all()), "photos are never doubted"
-    assert float(told[1][VIEWS][PAINTED].mean()) < 0.5
+    trust = pixel_trust(made, inputs.views.images)
+    assert bool((trust[:VIEWS] == 1).all())
+    assert float(trust[VIEWS][PAINTED].mean()) < 0.5
 
 
 def test_which_estimate_was_taken_is_written_down(truth: tuple[torch.Tensor, Priors]) -> None:
@@ -285,16 +286,16 @@ def test_which_estimate_was_taken_is_written_down(truth: tuple[torch.Tensor, Pri
     bent[1] *= 0.7
     worse = replace(inputs, joint_priors=replace(priors, depth=bent))
     for given, estimate in ((worse, Estimate.HELD), (inputs, Estimate.JOINT)):
-        taken, corrections = realigned_priors(given, loaded, Realign.CHOOSE, seed=0)
+        taken, corrections = realign_priors(given, loaded, Realign.CHOOSE, seed=0)
         assert corrections.estimate is estimate
         assert corrections.joint_error is not None
         assert corrections.held_error is not None
         assert (corrections.held_error < corrections.joint_error) == (estimate is Estimate.HELD)
         assert (taken is given.joint_priors) == (estimate is Estimate.JOINT)
-    _, corrections = realigned_priors(inputs, loaded, Realign.REFINE, seed=0)
+    _, corrections = realign_priors(inputs, loaded, Realign.REFINE, seed=0)
     assert corrections.estimate is Estimate.HELD
     assert corrections.refinement is not None
-    assert realigned_priors(inputs, loaded, Realign.NONE, seed=0)[1].estimate is Estimate.JOINT
+    assert realign_priors(inputs, loaded, Realign.NONE, seed=0)[1].estimate is Estimate.JOINT
 
 
 def test_a_photo_without_a_camera_has_no_say_in_the_choice(
@@ -307,7 +308,7 @@ def test_a_photo_without_a_camera_has_no_say_in_the_choice(
         compared.append(photos.tolist())
         return 0.0
 
-    monkeypatch.setattr(rounds_module, "_photo_error", spy)
+    monkeypatch.setattr(camera_module, "_photo_error", spy)
     inputs = start(truth, loaded)
     for before, after, expected in (
         ([True, True, False], [True, True, True, True], [True, True, False, False]),
@@ -316,7 +317,7 @@ def test_a_photo_without_a_camera_has_no_say_in_the_choice(
     ):
         state = replace(inputs.state, priors=replace(inputs.state.priors, posed=torch.tensor(before)))
         joint = replace(inputs.joint_priors, posed=torch.tensor(after))
-        realigned_priors(replace(inputs, state=state, joint_priors=joint), loaded, Realign.CHOOSE, seed=0)
+        realign_priors(replace(inputs, state=state, joint_priors=joint), loaded, Realign.CHOOSE, seed=0)
         assert compared[-2:] == [expected, expected]
 
 
@@ -340,12 +341,12 @@ def test_steps_are_spent_where_there_is_something_to_repair(
     moved[1] *= factor
     inputs = replace(start(truth, loaded), joint_priors=replace(priors, depth=moved))
     config = replace(PLAIN, spend=spend, spend_above=above)
-    state, made, result = adapt_round(inputs, loaded, config, seed=0)
-    assert len(result.records) == (PLAIN.steps if steps else 0)
-    assert bool(state.weights.change) == steps
+    made = make_procedure(config).run(inputs, loaded, seed=0)
+    assert len(made.adaptation.records) == (PLAIN.steps if steps else 0)
+    assert bool(made.state.weights.change) == steps
     if not steps:
-        _, still, _ = adapt_round(inputs, loaded, replace(config, steps=0), seed=0)
-        assert torch.equal(made.depth, still.depth)
+        still = make_procedure(replace(config, steps=0)).run(inputs, loaded, seed=0)
+        assert torch.equal(made.scene.depth, still.scene.depth)
 
 
 def test_a_placeholder_hardly_moves_the_inserted_camera(truth: tuple[torch.Tensor, Priors]) -> None:
@@ -358,7 +359,7 @@ def test_a_placeholder_hardly_moves_the_inserted_camera(truth: tuple[torch.Tenso
     inputs = start(truth, loaded)
     captured = replace(inputs.state.priors, world_from_cam=poses, posed=posed)
     inputs = replace(inputs, state=replace(inputs.state, priors=captured))
-    held, _ = realigned_priors(inputs, loaded, Realign.HOLD, seed=0)
+    held, _ = realign_priors(inputs, loaded, Realign.HOLD, seed=0)
     torch.testing.assert_close(held.world_from_cam[-1], priors.world_from_cam[-1], atol=1e-4, rtol=0)
     torch.testing.assert_close(held.depth[-1], priors.depth[-1], rtol=1e-4, atol=0)
     verdict = judge_round(inputs)
@@ -373,8 +374,6 @@ def test_the_fit_of_a_round_sees_what_the_round_worked_with(
     truth: tuple[torch.Tensor, Priors], monkeypatch: pytest.MonkeyPatch, trust: bool
 ) -> None:
     loaded = loaded_model()
-    config = replace(STILL, tone=True, trust=trust)
-    state, made, _ = adapt_round(start(truth, loaded, paint=True), loaded, config, seed=0)
     told: list[tuple[torch.Tensor, torch.Tensor | None]] = []
 
     def spy(start: Reconstruction, images: torch.Tensor, config: RefineConfig, **more: torch.Tensor | None) -> object:
@@ -382,7 +381,9 @@ def test_the_fit_of_a_round_sees_what_the_round_worked_with(
         return start, None
 
     monkeypatch.setattr(fitting_module, "refine", spy)
-    refined_round(made, state, config, RefineConfig(visits=1), seed=0)
+    sections = {"colour": Colour(match=True), "contradiction": Contradiction(fade=trust)}
+    procedure = make_procedure(STILL, RefineConfig(visits=1), **sections)
+    state = procedure.run(start(truth, loaded, paint=True), loaded, seed=0).state
     images, weights = told[0]
     assert torch.equal(images, state.toned_views.images)
     assert not torch.equal(images, state.views.images)

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from sceneexpander.adaptation.warmup import WarmupConfig
 from sceneexpander.expansion import LoadedModel, ModelConfig, initial_state, load_model
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.frontend.sfm_types import SfmConfig, SfmReport
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.ingest import IngestConfig, load_scene
+from sceneexpander.photometric.config import WarmupConfig
 from sceneexpander.splatting import render
 from sceneexpander.synthetic import make_views
 

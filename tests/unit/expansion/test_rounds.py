@@ -8,7 +8,6 @@ import torch
 from safetensors.torch import save_file
 
 from sceneexpander.adaptation.config import AdaptConfig
-from sceneexpander.adaptation.warmup import WarmupConfig, held_out_cells, warm_up
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import RoundSpec, Scene
@@ -20,7 +19,6 @@ from sceneexpander.expansion import (
     ModelConfig,
     PriorsUse,
     RoundInputs,
-    adapt_round,
     captured_prediction,
     initial_state,
     joint_reconstruction,
@@ -30,6 +28,9 @@ from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.omnivggt import OmniVGGT, OmniVGGTConfig
 from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
+from sceneexpander.photometric.config import WarmupConfig
+from sceneexpander.photometric.warmup import held_out_cells, warm_up
+from tests.support.methods import make_procedure
 from tests.support.tiny_model import TinyReconstructor, tiny_images
 from tests.unit.artifacts.test_artifacts import make_views
 
@@ -64,7 +65,7 @@ def _round(loaded: LoadedModel, config: AdaptConfig = CONFIG) -> tuple[RoundInpu
     inserted = _inserted()
     priors, backbone, _ = joint_reconstruction(state, inserted, loaded, FrontendConfig(), seed=0)
     inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
-    _, expanded, _ = adapt_round(inputs, loaded, config, seed=0)
+    expanded = make_procedure(config).run(inputs, loaded, seed=0).scene
     return inputs, backbone, expanded
 
 
@@ -88,7 +89,8 @@ def test_an_adapted_round_differs_and_marks_what_was_generated() -> None:
 def test_the_second_round_starts_from_the_first(tmp_path: Path) -> None:
     loaded = _tiny()
     inputs, _, _ = _round(loaded)
-    first, reconstruction, _ = adapt_round(inputs, loaded, CONFIG, seed=0)
+    made = make_procedure(CONFIG).run(inputs, loaded, seed=0)
+    first, reconstruction = made.state, made.scene
     first.save(tmp_path / "state")
     state = type(first).load(tmp_path / "state")
     anchors, captured = captured_prediction(state, loaded)
@@ -97,7 +99,8 @@ def test_the_second_round_starts_from_the_first(tmp_path: Path) -> None:
     inserted = _inserted(2)
     priors, _, _ = joint_reconstruction(state, inserted, loaded, FrontendConfig(), seed=0)
     second = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
-    after, expanded, _ = adapt_round(second, loaded, CONFIG, seed=0)
+    again = make_procedure(CONFIG).run(second, loaded, seed=0)
+    after, expanded = again.state, again.scene
     assert len(after.views) == 5
     assert expanded.generated.tolist() == [False, False, False, True, True]
 
@@ -124,7 +127,8 @@ def test_worldmirror_runs_a_round_with_strictly_loaded_weights(tmp_path: Path) -
     anchors, _ = captured_prediction(state, loaded)
     priors, backbone, _ = joint_reconstruction(state, inserted, loaded, FrontendConfig(), seed=0)
     inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
-    after, expanded, result = adapt_round(inputs, loaded, replace(CONFIG, insertion_probability=1.0), seed=0)
+    made = make_procedure(replace(CONFIG, insertion_probability=1.0)).run(inputs, loaded, seed=0)
+    after, expanded, result = made.state, made.scene, made.adaptation
     assert not torch.equal(backbone.depth, expanded.depth)
     untouched = [name for name in loaded.base if name.startswith(("gs_head.", "gs_renderer.", "pts_head."))]
     assert untouched

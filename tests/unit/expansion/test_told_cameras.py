@@ -11,8 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from sceneexpander.adaptation.config import AdaptConfig, Realign
-from sceneexpander.adaptation.warmup import WarmupConfig
+from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.scene import KnownCameras, Scene
 from sceneexpander.artifacts.state import ExpansionState
@@ -20,7 +19,6 @@ from sceneexpander.expansion import (
     LoadedModel,
     PriorsUse,
     RoundInputs,
-    adapt_round,
     captured_prediction,
     initial_state,
     joint_reconstruction,
@@ -31,8 +29,10 @@ from sceneexpander.generation import ChoiceConfig, GenerationContext, check_roun
 from sceneexpander.generation.backends.stored import ReplayConfig
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.ingest import IngestConfig, load_scene
+from sceneexpander.photometric.config import WarmupConfig
 from sceneexpander.reconstruction import views
 from sceneexpander.reconstruction.optics import known_of
+from tests.support.methods import make_procedure
 from tests.support.tiny_model import TinyReconstructor
 
 COURTYARD = Path(__file__).parents[3] / "scenes" / "courtyard"
@@ -148,9 +148,8 @@ def test_known_cameras_hold_in_both_estimates_and_in_later_rounds(tmp_path: Path
     assert priors.world_from_cam is not None
     # Each estimate has its own unit, the depth of the first view: the two are nearly one.
     torch.testing.assert_close(priors.world_from_cam[:PHOTOS], state.priors.world_from_cam, atol=0.02, rtol=0.05)
-    config = AdaptConfig(steps=0, realign=Realign.NONE)
     inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)
-    after, _, _ = adapt_round(inputs, loaded, config, seed=0)
+    after = make_procedure(AdaptConfig(steps=0)).run(inputs, loaded, seed=0).state
     assert after.known is not None
     torch.testing.assert_close(after.known.intrinsics_px, known.intrinsics_px)
 

@@ -11,7 +11,7 @@ from test_epipolar import model_of, noisy, seen_through
 
 from sceneexpander.frontend.bundle import rotation_exp
 from sceneexpander.frontend.evidence import ViewEvidence, weigh_evidence
-from sceneexpander.frontend.lens_tests import find_apart_group, pair_costs
+from sceneexpander.frontend.lens_tests import find_apart_group, pair_costs, rival_lens_deg
 from sceneexpander.frontend.mapping import directions_between_deg
 from sceneexpander.frontend.search import CameraSearch
 from sceneexpander.frontend.sfm_setup import KnownCameras
@@ -114,7 +114,13 @@ def test_each_kind_of_evidence_can_fail(change: dict[str, float], said: str) -> 
 
 
 def test_doubts_are_no_refusals() -> None:
-    for change in ({"agreeing": 0.6}, {"direction_sigma_deg": 20.0}, {"rival_angle_deg": 20.0}, {"spread_deg": 20.0}):
+    for change in (
+        {"agreeing": 0.6},
+        {"rotation_gap_deg": 12.0},
+        {"direction_sigma_deg": 20.0},
+        {"rival_angle_deg": 20.0},
+        {"spread_deg": 20.0},
+    ):
         found = replace(FINE, **change)
         assert found.doubt(CONFIG)
         assert not found.refusal(CONFIG)
@@ -130,6 +136,14 @@ def test_two_lenses_taken_for_one_fall_apart_and_one_lens_does_not() -> None:
     two = seen_through(seen_through(world, 1, zoom=0.5), 3, zoom=0.5)
     mapping, features, pairs = model_of(noisy(two))
     assert sorted(find_apart_group(mapping, pair_costs(mapping, features, pairs))) == [1, 3]
+
+
+def test_a_view_that_another_focal_explains_better_is_in_doubt_and_no_other_is() -> None:
+    world = worlds.point_world(58, points=250)
+    assert (rival_lens_deg(*model_of(noisy(world))) == 0).all()
+    turned = rival_lens_deg(*model_of(noisy(seen_through(world, 4, zoom=1.5))))
+    assert turned[4] > CONFIG.max_spread_deg
+    assert (turned[:4] == 0).all()
 
 
 def test_matches_behind_a_camera_do_not_agree_with_it() -> None:

@@ -11,7 +11,7 @@ import torch
 
 from sceneexpander.frontend import learned
 from sceneexpander.frontend.features import Features
-from sceneexpander.frontend.learned import detect_learned, match_learned, shared_descriptors
+from sceneexpander.frontend.learned import LearnedKeypoints, detect_learned, match_learned, shared_descriptors
 from sceneexpander.frontend.matching import Matches
 from sceneexpander.frontend.sfm import estimate_cameras
 from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig, SparseReconstruction
@@ -63,13 +63,20 @@ def test_a_view_left_out_is_matched_with_those_most_like_it(
     """Of six views, of three places two, each is matched with one other: the one of its own place."""
     others = [make_views(seed, views=2, height=240, width=320, split="test").images[:2] for seed in (5, 9)]
     images = torch.cat([views.images[:2], *others])
+    seen: list[LearnedKeypoints] = []
     asked: list[tuple[int, int]] = []
 
-    def note(keypoints: object, pairs: list[tuple[int, int]], config: object) -> dict[tuple[int, int], Matches]:
-        asked.extend(pairs)
-        return {}
+    def detect(image: torch.Tensor, config: SfmConfig) -> LearnedKeypoints:
+        seen.append(detect_learned(image, config))
+        return seen[-1]
 
-    monkeypatch.setattr(learned, "match_pairs", note)
+    def note(a: LearnedKeypoints, b: LearnedKeypoints, _: object) -> Matches:
+        first, second = (next(k for k, other in enumerate(seen) if other is own) for own in (a, b))
+        asked.append((first, second))
+        return Matches.empty()
+
+    monkeypatch.setattr(learned, "detect_learned", detect)
+    monkeypatch.setattr(learned, "match_learned", note)
     estimate_cameras(images, replace(BLIND, learned_candidates=1), generator=generator())
     assert len(asked) <= 6, "instead of fifteen"
     assert {(0, 1), (2, 3), (4, 5)} <= set(asked)

@@ -1,4 +1,4 @@
-"""Focal length and box directions from drawn lines whose camera is known."""
+"""Focal length from drawn lines whose camera is known."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ from torch import Tensor
 
 from sceneexpander.frontend.vanishing import (
     FocalEvidence,
-    box_angle_deg,
-    box_rotations,
     find_segments,
-    manhattan_frame,
     vanishing_focal,
 )
 
@@ -77,16 +74,11 @@ def evidence(images: list[Tensor]) -> FocalEvidence:
 
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("focal_ratio", [0.45, 0.8, 1.5])
-def test_one_view_tells_its_focal_and_turn(focal_ratio: float, turn: tuple[float, float, float]) -> None:
+def test_one_view_tells_its_focal(focal_ratio: float, turn: tuple[float, float, float]) -> None:
     rotation = cam_from_box(*turn)
     found = evidence([drawn_room(rotation, focal_ratio)])
     assert found.focal_ratio == pytest.approx(focal_ratio, rel=0.04)
     assert found.sigma < 0.1
-    frame = found.frames[0]
-    assert frame is not None
-    assert box_angle_deg(frame.cam_from_box, rotation) < 1.0
-    assert frame.confidence > 0.9
-    assert np.degrees(np.arccos(frame.down @ rotation[:, 1])) < 1.0
 
 
 def test_the_size_of_the_picture_and_its_shape_do_not_matter() -> None:
@@ -117,9 +109,6 @@ def test_a_frontal_view_knows_that_it_says_nothing_about_the_focal(focal_ratio: 
     image = drawn_room(cam_from_box(0, 0, 0), focal_ratio)
     found = vanishing_focal([image])
     assert found is None or found.sigma > 0.15
-    frame = manhattan_frame(image, focal_ratio)
-    assert frame is not None
-    assert box_angle_deg(frame.cam_from_box, np.eye(3)) < 1.0
 
 
 @pytest.mark.parametrize(
@@ -128,8 +117,6 @@ def test_a_frontal_view_knows_that_it_says_nothing_about_the_focal(focal_ratio: 
 def test_pictures_without_lines_say_nothing(image: Tensor) -> None:
     found = vanishing_focal([image, image])
     assert found is None or found.sigma > 0.2
-    if not image.any():
-        assert manhattan_frame(image, 0.9) is None
 
 
 def test_the_same_pictures_give_the_same_bits() -> None:
@@ -146,12 +133,3 @@ def test_pieces_of_one_line_are_joined() -> None:
     found = find_segments(canvas)
     assert found.count <= 4  # its two edges, and nothing but them
     assert max(found.length) * 400 == pytest.approx(244, abs=6)
-
-
-def test_a_box_has_24_rotations() -> None:
-    turns = box_rotations()
-    assert len({turn.tobytes() for turn in turns}) == 24
-    assert np.allclose(np.linalg.det(turns), 1)
-    frame = cam_from_box(*TURNS[1])
-    assert max(box_angle_deg(frame @ turn, frame) for turn in turns) < 1e-4
-    assert box_angle_deg(cam_from_box(20, 0, 0) @ turns[7], np.eye(3)) == pytest.approx(20, abs=1e-4)

@@ -59,7 +59,11 @@ def answered(*parts: dict[str, Any], reason: str = "STOP", **facts: Any) -> Answ
 
 
 def shown(seed: int) -> dict[str, Any]:
-    return {"inlineData": {"mimeType": "image/png", "data": base64.b64encode(drawn(seed)).decode()}}
+    return inline(drawn(seed))
+
+
+def inline(data: bytes) -> dict[str, Any]:
+    return {"inlineData": {"mimeType": "image/png", "data": base64.b64encode(data).decode()}}
 
 
 def failed(status: int, message: str, name: str, details: object = ()) -> Answer:
@@ -106,6 +110,10 @@ def test_what_is_sent_and_what_is_recorded(service: Service, so_far: SceneSoFar,
         (failed(404, "models/x is not found", "NOT_FOUND"), "set generator.model", 1),
         (failed(403, "denied", "PERMISSION_DENIED"), "may not use this model", 1),
         (failed(503, "overloaded", "UNAVAILABLE"), "overloaded", 2),
+        (failed(429, "quota exceeded", "RESOURCE_EXHAUSTED"), "quota exceeded", 2),
+        (answered(inline(drawn(1, 1, 1))), "has only 1 x 1 pixels", 1),
+        (answered(inline(b"<svg/>")), "is not a picture", 1),
+        (answered(inline(drawn(1)[:900])), "damaged or truncated", 1),
         (Answer(body=b"{half"), "not what Gemini answers", 2),
         (Answer(body=b'{"candidates": [' + b"1" * 500, cut=True), "no connection", 2),
     ],

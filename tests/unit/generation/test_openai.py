@@ -235,17 +235,39 @@ def test_the_budget_is_looked_at_before_anything_is_sent(
     service: Service, so_far: SceneSoFar, context: GenerationContext
 ) -> None:
     service.answers = [picture(1)]
-    with pytest.raises(UserError, match=r"more than generator\.max_cost_usd"):
+    with pytest.raises(UserError, match=r"beyond generator\.max_cost_usd"):
         generator(service, max_cost_usd=0.03).generate(context, so_far)
     assert service.asked == []
     made = generator(service, candidates=5, max_cost_usd=0.09).generate(context, so_far)
     assert (len(made.candidates), len(service.asked)) == (2, 2)
     service.answers = [error(500, "oops")]
-    with pytest.raises(UserError, match=r"2 requests were sent, as many as generator.max_requests allows"):
+    with pytest.raises(UserError, match=r"2 requests were sent: one more is beyond generator\.max_requests"):
         generator(service, take=1, max_requests=2, attempts=9).generate(context, so_far)
     assert len(service.asked) == 4
     with pytest.raises(UserError, match="price_usd: is not known"):
         settings(service, price_usd=None, max_cost_usd=1.0)
+
+
+def test_the_scenes_budget_is_over_all_rounds_and_runs(
+    service: Service, so_far: SceneSoFar, context: GenerationContext
+) -> None:
+    service.answers = [picture(number) for number in range(1, 6)]
+    next_round = replace(context, round_number=2)
+    generator(service).generate(context, so_far)
+    with pytest.raises(UserError, match=r"2 requests were sent for the scene so far: one more is beyond"):
+        generator(service, take=1, max_scene_requests=2).generate(next_round, so_far)
+    with pytest.raises(UserError, match=r"0\.08 USD were asked for so far: .*max_scene_cost_usd"):
+        generator(service, take=1, max_scene_cost_usd=0.1).generate(next_round, so_far)
+    assert len(service.asked) == 2
+    made = generator(service, take=1, max_scene_cost_usd=0.12).generate(next_round, so_far)
+    assert (len(made.candidates), len(service.asked)) == (1, 3), "exactly up to the limit"
+    assert len(generator(service, max_scene_requests=1).generate(context, so_far).candidates) == 2, (
+        "kept ones cost nothing"
+    )
+    other = replace(context, scene="another")
+    assert len(generator(service, max_scene_requests=2, take=2).generate(other, so_far).candidates) >= 1
+    with pytest.raises(UserError, match=r"max_scene_cost_usd cannot be kept"):
+        settings(service, price_usd=None, max_scene_cost_usd=1.0)
 
 
 def test_a_check_is_free_and_needs_a_key_only_for_what_is_missing(

@@ -46,7 +46,7 @@ def test_scene_folder(tmp_path: Path) -> None:
     photo(tmp_path / "inserted" / "a.png", 9)
     folder = scene_folder(
         tmp_path,
-        "name: my scene\nsource: us\nrounds:\n  - prompt: 'A  bench.'\n    inserted: inserted/a.png\n"
+        "name: my scene\norigin: us\nrounds:\n  - prompt: 'A  bench.'\n    inserted: inserted/a.png\n"
         "  - {motion: move back, object: a squirrel sits on a stone bench}\n",
     )
     scene = load_scene(folder, CONFIG)

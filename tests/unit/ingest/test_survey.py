@@ -156,7 +156,7 @@ def test_a_folder_of_videos_says_so(tmp_path: Path) -> None:
     for name in ("a.mp4", "b.MOV"):
         (tmp_path / name).write_bytes(VIDEO)
     assert "holds no pictures, only: a video (2 times)" in load_line(tmp_path)
-    assert "is a file, expected a folder" in load_line(tmp_path / "a.mp4")
+    assert "cannot be read as a video" in load_line(tmp_path / "a.mp4")
 
 
 @pytest.mark.parametrize(

@@ -245,12 +245,12 @@ def test_a_slow_or_absent_service(service: Service, tmp_path: Path) -> None:
 
 def test_the_budget_is_looked_at_before_anything_is_sent(service: Service, tmp_path: Path) -> None:
     service.answers = [scored(4.0)]
-    with pytest.raises(UserError, match=r"4 requests were sent, as many as judge\.chat\.max_requests allows"):
+    with pytest.raises(UserError, match=r"4 requests were sent: one more is beyond judge\.chat\.max_requests"):
         judge_round(judge_of(service, tmp_path, max_requests=4), work_of("backbone"))
     assert len(service.asked) == 4
     judge_round(judge_of(service, tmp_path, max_requests=4), work_of("backbone"))
     assert len(service.asked) == 6, "what came is kept"
-    with pytest.raises(UserError, match=r"one more answer would cost more than judge\.chat\.max_cost_usd \(0\.05\)"):
+    with pytest.raises(UserError, match=r"one more answer is beyond judge\.chat\.max_cost_usd \(0\.05\)"):
         judge_round(judge_of(service, tmp_path, take=1, max_cost_usd=0.05, price_usd=0.02), work_of("backbone"))
     assert len(service.asked) == 8
     with pytest.raises(UserError, match="price_usd: is not known"):

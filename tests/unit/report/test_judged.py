@@ -28,7 +28,7 @@ def test_columns_without_a_judge_say_so() -> None:
     table = judged_table([JudgedRound(scene="s", round=1)], METHODS)
     assert [line[3:] for line in table.lines] == [("no judge", "no judge")] * 3
     assert comparisons_table([JudgedRound(scene="s", round=1)]) is None
-    shown = page_table(JudgedRound(scene="s", round=1), [{"name": "backbone", "label": "B"}])
+    shown = page_table(JudgedRound(scene="s", round=1), {"backbone": "B"})
     assert [cell["text"] for cell in shown["rows"][0]["cells"]] == ["no judge", "no judge"]
 
 

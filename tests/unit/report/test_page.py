@@ -12,7 +12,6 @@ import pytest
 import torch
 from PIL import Image
 
-from sceneexpander.adaptation.acceptance import Acceptance
 from sceneexpander.adaptation.observe import Look
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.metrics import Fit, MetricsRow, UnavailableRow
@@ -22,7 +21,8 @@ from sceneexpander.artifacts.source_type import read_source_type
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
-from sceneexpander.optimisation.refine import RefineReport
+from sceneexpander.insertion.acceptance import Acceptance
+from sceneexpander.photometric.report import FitReport
 from sceneexpander.rendering.config import RenderConfig
 from sceneexpander.rendering.produce import produce_renders
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene, write_page
@@ -146,7 +146,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> SceneSource:
     )
     save_looks(folder, [look(0, 22.25), look(40, 21.5)], [HARM])
     write_json_atomic(folder / "acceptance.json", FITTING)
-    write_json_atomic(folder / "captured" / "refinement.json", RefineReport(steps=80, before=0.082, after=0.0312))
+    write_json_atomic(folder / "captured" / "refinement.json", FitReport(steps=80, before=0.082, after=0.0312))
     return SceneSource(
         scene=folder / "scene",
         report=folder / "report.json",

@@ -91,6 +91,47 @@ def test_warp_is_smooth_and_bounded() -> None:
     np.testing.assert_allclose(shifted[:-2, :-2], picture[2:, 2:], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        Misalignment(stretch=0.08),
+        Misalignment(zoom=0.2),
+        Misalignment(shift_fraction=0.05),
+        Misalignment(stretch=0.04, zoom=0.1, shift_fraction=0.02, warp_fraction=0.02),
+    ],
+)
+def test_the_truth_map_says_where_everything_went(view: tuple, asked: Misalignment) -> None:
+    world, pose = view
+    clean = render_world(world, pose[None], CAMERA[None], HEIGHT, WIDTH).object_id[0].astype(np.float32)
+    got = misalign(world, pose, CAMERA, HEIGHT, WIDTH, asked, np.random.default_rng(6), exposure=1.0)
+    undone = warp_image(clean, got.warp_px, nearest=True)
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    there = np.stack([x, y], -1) + got.warp_px
+    inside = (there >= 0).all(-1) & (there <= [WIDTH - 1, HEIGHT - 1]).all(-1)
+    assert inside.mean() > 0.7
+    # Labels change at borders, where half a pixel decides.
+    wrong, unmapped = (float((labels != got.object_id)[inside].mean()) for labels in (undone, clean))
+    assert wrong < 0.03
+    assert unmapped > 1.5 * wrong
+
+
+def test_stretch_zoom_and_shift_are_as_asked(view: tuple) -> None:
+    world, pose = view
+    middle = HEIGHT // 2, WIDTH // 2
+
+    def map_of(asked: Misalignment) -> np.ndarray:
+        got = misalign(world, pose, CAMERA, HEIGHT, WIDTH, asked, np.random.default_rng(7), exposure=1.0)
+        return got.warp_px
+
+    stretched, zoomed = map_of(Misalignment(stretch=0.08)), map_of(Misalignment(zoom=0.2))
+    assert np.diff(stretched[0, :, 0]) == pytest.approx(1 / 1.08 - 1, abs=1e-4)
+    assert stretched[..., 1] == pytest.approx(0, abs=1e-4)
+    assert np.diff(zoomed[:, 0, 1]) == pytest.approx(1 / 1.2 - 1, abs=1e-4)
+    assert np.hypot(*zoomed[middle]) < 0.2
+    shifted = map_of(Misalignment(shift_fraction=0.05))
+    assert np.hypot(shifted[..., 0], shifted[..., 1]) == pytest.approx(0.05 * WIDTH, abs=1e-3)
+
+
 def test_negative_grade_is_refused() -> None:
     with pytest.raises(ValueError, match="grade is -1"):
         Misalignment.graded(-1)

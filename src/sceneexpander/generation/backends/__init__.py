@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.generation.backends.comfyui import ComfyUIConfig, make_comfyui
+from sceneexpander.generation.backends.diffusers import DiffusersConfig, make_diffusers
 from sceneexpander.generation.backends.gemini import GeminiConfig, make_gemini
 from sceneexpander.generation.backends.openai import OpenAIConfig, make_openai
 from sceneexpander.generation.backends.reproject import ReprojectConfig, ReprojectGenerator
@@ -18,6 +19,7 @@ BACKENDS: dict[str, Backend] = {
     "openai": Backend(config=OpenAIConfig, make=make_openai),
     "gemini": Backend(config=GeminiConfig, make=make_gemini),
     "comfyui": Backend(config=ComfyUIConfig, make=make_comfyui),
+    "diffusers": Backend(config=DiffusersConfig, make=make_diffusers),
 }
 
 

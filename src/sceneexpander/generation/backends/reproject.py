@@ -26,6 +26,7 @@ from sceneexpander.splatting.render import render
 
 _MOSTLY_SEEN = 0.5  # of what covers a pixel: below it, the pixel counts as not seen
 _TOO_LITTLE_SEEN = 0.1  # of the picture
+_ALL = "which is all that reproject goes by"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +48,7 @@ class ReprojectGenerator:
 
     def check(self, context: GenerationContext) -> Forecast:
         """Read the motion. See `ViewGenerator`."""
-        self._steps(context)
+        motion_of(context, _ALL)
         names = [record.name for record in context.captured.records]
         if context.round_number == 1 and self.config.start not in (CENTRAL, *names):
             problem = f"there is no photo {self.config.start!r}"
@@ -58,20 +59,10 @@ class ReprojectGenerator:
 
     def generate(self, context: GenerationContext, so_far: SceneSoFar) -> CandidateSet:
         """One picture. See `ViewGenerator`."""
-        steps = self._steps(context)
-        view = start_view(so_far, self.config.start)
-        pose = moved_camera(so_far, steps, view, where=_where(context))
-        views, scene = so_far.views, so_far.reconstruction
-        height, width = views.detail_images.shape[-2:]
-        intrinsics = resize_intrinsics(scene.intrinsics_px[view], width / views.width, height / views.height)
-        with torch.no_grad():
-            seen = render(scene.gaussians, pose[None], intrinsics[None], height, width)
-        share = float((seen.alpha[0] >= _MOSTLY_SEEN).float().mean())
-        if share < _TOO_LITTLE_SEEN:
-            problem = f"leads to where the photos show only {share:.0%} of the picture"
-            raise UserError(problem, where=_where(context), fix="move or turn less")
-        picture = fill_unseen(seen.rgb[0], seen.alpha[0])
-        start = views.records[view].name
+        rgb, alpha, pose, start = seen_from_motion(context, so_far, self.config.start)
+        steps = motion_of(context, _ALL)
+        share = float((alpha >= _MOSTLY_SEEN).float().mean())
+        picture = fill_unseen(rgb, alpha)
         parameters = {
             "motion": ", ".join(step.words() for step in steps),
             "start": start,
@@ -85,7 +76,7 @@ class ReprojectGenerator:
             prompt=fill_prompt(context.spec),
             source="the scene so far",
             sha256=sha256_of_bytes(data),
-            reference_sha256=tuple(record.sha256 for record in views.records),
+            reference_sha256=tuple(record.sha256 for record in so_far.views.records),
             parameters=parameters,
             digital_source_type=MADE_FROM_SCENE,
         )
@@ -94,14 +85,35 @@ class ReprojectGenerator:
             round=context.round_number, candidates=(Candidate(data=data, name=name, provenance=provenance),)
         )
 
-    def _steps(self, context: GenerationContext) -> tuple[Step, ...]:
-        motion, _ = split_words(context.spec)
-        if not motion:
-            fix = f"say one with --motion, {EXAMPLE}"
-            raise UserError(
-                "says no camera motion, which is all that reproject goes by", where=_where(context), fix=fix
-            )
-        return parse_motion(motion, where=_where(context))
+
+def motion_of(context: GenerationContext, purpose: str) -> tuple[Step, ...]:
+    """The steps of a round's camera motion. Raises `UserError` without one; ``purpose`` says what it is needed for."""
+    motion, _ = split_words(context.spec)
+    if not motion:
+        fix = f"say one with --motion, {EXAMPLE}"
+        raise UserError(f"says no camera motion, {purpose}", where=_where(context), fix=fix)
+    return parse_motion(motion, where=_where(context))
+
+
+@torch.no_grad()
+def seen_from_motion(
+    context: GenerationContext, so_far: SceneSoFar, start: str
+) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"], Float[Tensor, "4 4"], str]:
+    """(RGB on black, alpha, ``world_from_cam``, name of the photo it starts from) of the scene from where a round's motion leads.
+
+    In detail pixels. Raises `UserError` if next to nothing is seen from there.
+    """
+    view = start_view(so_far, start)
+    pose = moved_camera(so_far, motion_of(context, _ALL), view, where=_where(context))
+    views, scene = so_far.views, so_far.reconstruction
+    height, width = views.detail_images.shape[-2:]
+    intrinsics = resize_intrinsics(scene.intrinsics_px[view], width / views.width, height / views.height)
+    seen = render(scene.gaussians, pose[None], intrinsics[None], height, width)
+    share = float((seen.alpha[0] >= _MOSTLY_SEEN).float().mean())
+    if share < _TOO_LITTLE_SEEN:
+        problem = f"leads to where the photos show only {share:.0%} of the picture"
+        raise UserError(problem, where=_where(context), fix="move or turn less")
+    return seen.rgb[0], seen.alpha[0], pose, views.records[view].name
 
 
 def _where(context: GenerationContext) -> str:

@@ -1,0 +1,166 @@
+"""A short fit of a reconstruction's Gaussians to its own pictures: what the splats of a feed-forward model lack to agree with each other.
+
+Such a model makes every view's Gaussians by themselves. Each set shows its own picture, but where several share a pixel, their colours
+and opacities do not add up to any of the pictures. A few visits to every view settle most of that, at the captured cameras and between
+them (docs/refinement.md). The pictures are taken at several sizes, that of the photos included, before a background of another colour each
+time, and no Gaussian gets narrower than what its finest view resolves: so the scene holds at other distances, too. Cameras, depth and
+normals stay as the model made them, and no Gaussian comes or goes: longer optimisation with densification is
+`sceneexpander.optimisation.optimise`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.geometry.randomness import child_generator
+from sceneexpander.geometry.rigid import rigid_inverse
+from sceneexpander.optimisation.config import RatesConfig
+from sceneexpander.optimisation.optimise import photometric_loss, scene_extent
+from sceneexpander.optimisation.pictures import Picture, Pictures
+from sceneexpander.optimisation.splats import Splats
+from sceneexpander.photometric.config import RefineConfig
+from sceneexpander.photometric.report import FitReport
+from sceneexpander.splatting import RasterSettings, rasterise
+
+_LAST_RATE = 0.05  # of the first, reached along a cosine
+_COMPENSATED = RasterSettings(antialiased=True)
+
+
+def refine(
+    start: Reconstruction,
+    images: Float[Tensor, "view 3 height width"],
+    config: RefineConfig,
+    *,
+    photos: Sequence[UInt8[Tensor, "3 photo_height photo_width"]] | None = None,
+    weights: Float[Tensor, "view height width"] | None = None,
+    seed: int,
+    device: torch.device | str = "cpu",
+    on_step: Callable[[int, float], None] | None = None,
+) -> tuple[Reconstruction, FitReport | None]:
+    """Fit means, shapes, opacities and colours of ``start``'s Gaussians to the pictures of its posed views.
+
+    On a CPU the same input gives the same bits, for any number of threads of the rasteriser.
+
+    Args:
+        start: cameras and Gaussians.
+        images: pictures of its views, in order, RGB in [0, 1], at its size.
+        config: settings; without visits the start is returned.
+        photos: the same pictures in the photos' own pixels; None: nothing finer is known.
+        weights: of pixels, in [0, 1]: how much a picture is to be believed there; 1 everywhere by default.
+        seed: order of the views and backgrounds.
+        device: where to work.
+        on_step: told the number of finished steps and the last loss.
+
+    Returns:
+        The reconstruction with other Gaussians, meant for rasterisers that compensate for the screen blur (the old ones if the loss did
+        not fall), and the mean photometric loss over the target views, as their photos show them (None: nothing to do).
+
+    Raises:
+        ValueError: sizes do not fit.
+    """
+    if images.shape[2:] != start.depth.shape[1:] or (weights is not None and weights.shape != start.depth.shape):
+        raise ValueError(f"pictures of {tuple(images.shape)} do not fit depths of {tuple(start.depth.shape)}")
+    targets = [
+        view for view in start.posed.nonzero()[:, 0].tolist() if weights is None or bool((weights[view] > 0).any())
+    ]
+    steps = config.visits * len(targets)
+    if steps == 0 or len(start.gaussians) == 0:
+        return start, None
+    pictures = Pictures(images, photos, start.intrinsics_px, weights, torch.device(device))
+    fit = _Fit(start, pictures, config, targets, torch.device(device))
+    before = fit.mean_loss(targets)
+    for step in range(steps):
+        turn, place = divmod(step, len(targets))
+        order = torch.randperm(len(targets), generator=child_generator(seed, f"refine/{turn}"))
+        background = torch.rand(3, generator=child_generator(seed, f"refine/background/{step}"))
+        picture = fit.picture(targets[int(order[place])], turn)
+        loss = fit.step(targets[int(order[place])], picture, background, step / steps)
+        if on_step is not None:
+            on_step(step + 1, loss)
+    report = FitReport(steps=steps, before=before, after=fit.mean_loss(targets))
+    return (replace(start, gaussians=fit.splats.gaussians()) if report.accepted else start), report
+
+
+class _Fit:
+    """The Gaussians as they move."""
+
+    def __init__(
+        self,
+        start: Reconstruction,
+        pictures: Pictures,
+        config: RefineConfig,
+        targets: list[int],
+        device: torch.device,
+    ) -> None:
+        self._pictures = pictures
+        world_from_cam = start.world_from_cam.to(device)
+        self._cam_from_world = rigid_inverse(world_from_cam)
+        self._ssim_weight, self._solid = config.ssim_weight, config.solid_weight
+        rates = RatesConfig(
+            means=config.means,
+            scales=config.scales,
+            rotations=config.rotations,
+            opacities=config.opacities,
+            colours=config.colours,
+        )
+        gaussians = pictures.compensated(start.gaussians.to(device), world_from_cam)
+        self._degree = math.isqrt(gaussians.sh.shape[1]) - 1
+        self.splats = Splats.of(
+            gaussians,
+            rates,
+            extent=scene_extent(start),
+            sh_degree=self._degree,
+            finest=pictures.finest_pixel(gaussians.means, world_from_cam, targets),
+        )
+        self._rates = {name: o.param_groups[0]["lr"] for name, o in self.splats.optimisers.items()}
+
+    def picture(self, view: int, turn: int) -> Picture:
+        """What a view is compared with in one of its visits: sizes take turns."""
+        return (self._pictures.own, self._pictures.stored, self._pictures.own, self._pictures.half)[turn % 4](view)
+
+    def step(self, view: int, picture: Picture, background: Float[Tensor, "3"], progress: float) -> float:
+        """One view, one update; ``progress`` in [0, 1) says how far the rates have fallen."""
+        share = max(0.5 * (1 + math.cos(math.pi * progress)), _LAST_RATE)
+        for name, optimiser in self.splats.optimisers.items():
+            optimiser.param_groups[0]["lr"] = self._rates[name] * share
+        loss = self._loss(view, picture, background)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.splats.step()
+        return float(loss.detach())
+
+    @torch.no_grad()
+    def mean_loss(self, views: list[int]) -> float:
+        """Of several views, on grey."""
+        grey = torch.full((3,), 0.5)
+        return float(torch.stack([self._loss(view, self._pictures.own(view), grey) for view in views]).mean())
+
+    def _loss(self, view: int, picture: Picture, background: Float[Tensor, "3"]) -> Float[Tensor, ""]:
+        splats = self.splats
+        seen = rasterise(
+            splats.params["means"],
+            splats.params["quats"],
+            splats.scales,
+            splats.opacities,
+            splats.colours(self._degree),
+            self._cam_from_world[view : view + 1],
+            picture.intrinsics_px[None],
+            picture.height,
+            picture.width,
+            background=background.to(picture.rgb),
+            with_depth=False,
+            settings=_COMPENSATED,
+        )
+        through = 1 - seen.alpha[0]
+        if picture.weights is not None:
+            through = through * picture.weights
+        return (
+            photometric_loss(seen.rgb[0], picture.rgb, self._ssim_weight, picture.weights)
+            + self._solid * through.mean()
+        )
