@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from sceneexpander.catalogue import MAIN
@@ -18,6 +19,11 @@ ENVIRONMENT = OUTPUTS / "environment.json"  # that the hashes in CODE belong to
 REPEATS = "repeat_*"
 RECORDED = "recorded"  # in a round's folder of what was asked for: a copy of the pictures that scene.yaml names
 REFINEMENT = "refinement.json"  # beside a reconstruction whose Gaussians were refined: what it changed
+
+
+def gathered_scenes(scenes: Sequence[str]) -> list[str]:
+    """Those of ``scenes`` that there is something to show of; the others failed on their way."""
+    return [scene for scene in scenes if (PAGES / scene).is_dir()]
 
 
 def source(scene: str) -> Path:

@@ -51,7 +51,12 @@ def main(_: Cell) -> None:
     """
     keys: dict[str, list[str] | None] = {}
     root = project_root()
-    for scene in read_selection(Path()).scenes:
+    selected = read_selection(Path()).scenes
+    gathered = layout.gathered_scenes(selected)
+    for scene in selected:
+        if scene not in gathered:
+            keys[scene] = None
+            continue
         sections = read_sections(layout.PAGES / scene / layout.PAGE_CONFIG, Sections)
         records = scene_runs(
             layout.PAGES / scene,

@@ -30,6 +30,7 @@ from sceneexpander.errors import EXIT_BAD_INPUT, UserError, entry_point, printab
 from sceneexpander.pipeline.declared import (
     DeclaredStage,
     find_predecessors,
+    find_stale,
     read_pipeline,
     select_stages,
 )
@@ -120,10 +121,12 @@ class PlainRunner:
         self.failed: dict[str, int] = {}
         self.left_out: list[str] = []
         self.ran: list[str] = []
+        self._stages: Sequence[DeclaredStage] = ()
         self._parameter_files: dict[tuple[str, str], Any] = {}
 
     def run(self, stages: Sequence[DeclaredStage]) -> None:
         """Run what has changed. What failed, and what was left out because of it, is in `failed` and `left_out`."""
+        self._stages = stages
         before = {address: set(found) for address, found in find_predecessors(stages).items()}
         waiting = {stage.address: stage for stage in stages}
         done: set[str] = set()
@@ -136,7 +139,7 @@ class PlainRunner:
                         if self._can_run(stage, before[stage.address]):
                             running[pool.submit(self._bring_up_to_date, stage)] = stage
                         else:
-                            self.left_out.append(stage.address)
+                            self._leave_out(stage)
                             done.add(stage.address)
                 if not running:
                     if not self._may_start():
@@ -148,6 +151,7 @@ class PlainRunner:
                     code = future.result()
                     if code:
                         self.failed[stage.address] = code
+                        self._remove_stale(stage)
                     done.add(stage.address)
                     self._save()
 
@@ -173,7 +177,15 @@ class PlainRunner:
         lost = before & {*self.failed, *self.left_out}
         if not lost:
             return True
-        return "@" not in stage.address and all((self.folder / path).exists() for path in stage.reads)
+        return stage.gathers and all((self.folder / path).exists() for path in stage.reads)
+
+    def _leave_out(self, stage: DeclaredStage) -> None:
+        self.left_out.append(stage.address)
+        self._remove_stale(stage)
+
+    def _remove_stale(self, stage: DeclaredStage) -> None:
+        for path in find_stale(self._stages, {stage.address}):
+            remove_tree(self.folder / path)
 
     def _bring_up_to_date(self, stage: DeclaredStage) -> int | None:
         if self.is_up_to_date(stage):
