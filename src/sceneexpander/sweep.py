@@ -65,7 +65,7 @@ def run_job(folder: Path, job: Job, project: Path, *, sweep: str | None = None) 
     """
     selection = job.selection(read_selection(project), project)
     try:
-        _check(selection, project)
+        _check(selection, project, device=True, store=False)
         workspace = make_workspace(folder / "workspace", selection, project=project)
         reproduce_shared(workspace, project=project, sweep=sweep)
     except UserError as error:
@@ -78,7 +78,7 @@ def run_job(folder: Path, job: Job, project: Path, *, sweep: str | None = None) 
     remove_tree(workspace)
 
 
-def _check(selection: Selection, project: Path, *, device: bool = True) -> None:
+def _check(selection: Selection, project: Path, *, device: bool, store: bool) -> None:
     for scene in selection.scenes:
         check_scene(
             scene,
@@ -89,6 +89,7 @@ def _check(selection: Selection, project: Path, *, device: bool = True) -> None:
             round_overrides=selection.round_overrides,
             methods=selection.methods,
             device=device,
+            store=store,
             checked=_CHECKED,
         )
 
@@ -164,7 +165,7 @@ def check_inputs(jobs: Sequence[Job], project: Path) -> None:
             key = (scene, repr([composed[section] for section in CHECKED_SECTIONS]))
             if key not in seen:
                 seen.add(key)
-                _check(replace(selection, scenes=(scene,)), project, device=False)
+                _check(replace(selection, scenes=(scene,)), project, device=False, store=True)
 
 
 def _scene_names(item: str, project: Path) -> list[str]:
