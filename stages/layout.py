@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sceneexpander.catalogue import MAIN
+from sceneexpander.pipeline.unasked import METHODS_FILE
 
 SCENES = Path("scenes")
 OUTPUTS = Path("outputs")
@@ -38,7 +39,7 @@ def config(scene: str) -> Path:
 
 def selection(scene: str) -> Path:
     """Which methods params.yaml asks for: one key per method that is not always made."""
-    return OUTPUTS / scene / "methods.yaml"
+    return OUTPUTS / scene / METHODS_FILE
 
 
 def given(scene: str, kind: str) -> Path:

@@ -59,7 +59,8 @@ def main(_: Cell) -> None:
                 numbers.setdefault(scene, {}).setdefault(f"round_{number}", {})[method] = known
     if not rows:
         raise UserError("selects nothing to report", where="params.yaml", fix="name scenes, rounds and methods")
-    for scene in [scene for scene in selected.scenes if scene not in scenes]:
+    missing = [scene for scene in selected.scenes if scene not in scenes]
+    for scene in missing:
         _log.warning("scene %s is missing: a stage before failed", scene)
         for number in range(1, selected.rounds + 1):
             for method in selected.methods:
@@ -70,7 +71,7 @@ def main(_: Cell) -> None:
                 rows.append(row)
                 numbers.setdefault(scene, {}).setdefault(f"round_{number}", {})[method] = {"unavailable": row.reason}
     with directory_being_written(layout.REPORT) as folder:
-        write_page([layout.PAGES / scene for scene in scenes], folder)
+        write_page([layout.PAGES / scene for scene in scenes], folder, missing=missing)
         for name, table in (("comparison", comparison_table(rows)), ("scenes", scene_table(rows))):
             for ending, text in (("md", table.markdown()), ("csv", table.csv()), ("tex", table.latex())):
                 write_bytes_atomic(folder / f"{name}.{ending}", text.encode())

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneexpander.artifacts.store import write_bytes_atomic
+from sceneexpander.pipeline.unasked import answer_unasked
 
 
 def reproduce(arguments: Sequence[str]) -> int:
@@ -22,6 +23,7 @@ def reproduce(arguments: Sequence[str]) -> int:
 
     _take_any_path()
     _write_locks_by_stage()
+    _answer_unasked()
     return int(main(["repro", *arguments]))
 
 
@@ -81,6 +83,7 @@ def reproduce_stage(address: str) -> None:
     from dvc.repo import Repo
 
     _write_locks_by_stage()
+    _answer_unasked()
     Repo().reproduce(targets=[address], single_item=True)
 
 
@@ -115,6 +118,25 @@ def _take_any_path() -> None:
         original(self, iterable, total=total, name=shown, phase=phase)
 
     bar.__init__, bar._takes_any_path = escaped, True
+
+
+def _answer_unasked() -> None:
+    """Let DVC start no process for a stage that only says that its method was not asked for.
+
+    Does nothing with a version of DVC that runs commands in another place: the stage says so itself then.
+    """
+    from dvc.stage import run
+
+    if hasattr(run, "_answers_unasked") or not hasattr(run, "cmd_run"):
+        return
+    original, module = run.cmd_run, vars(run)
+
+    def cmd_run(stage: Any, dry: bool = False, run_env: Any = None) -> None:
+        parameters = {Path(file.fs_path): list(file.params) for file in stage.params}
+        if dry or not answer_unasked(parameters, [Path(out.fs_path) for out in stage.outs]):
+            original(stage, dry=dry, run_env=run_env)
+
+    module["cmd_run"], module["_answers_unasked"] = cmd_run, True
 
 
 _STAGE_LINE = re.compile(r"^  (?=[^ ])", re.MULTILINE)

@@ -38,6 +38,7 @@ from sceneexpander.pipeline.disk import remove_tree, require_room
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.recording import ask_for_recording
 from sceneexpander.pipeline.surroundings import pipeline_environment
+from sceneexpander.pipeline.unasked import answer_unasked
 from sceneexpander.processes import ended_by_signals, kept
 from sceneexpander.project import find_project
 
@@ -204,10 +205,13 @@ class PlainRunner:
         command = [sys.executable if program == "python" else program, *arguments]
         environment = pipeline_environment(self.folder, self.folder) | {"DVC_STAGE": stage.address}
         started = time.monotonic()
-        with kept(command, cwd=self.folder, env=environment, held=self.held) as process:
-            self._processes.add(process)
-            code = process.wait()
-            self._processes.discard(process)
+        code = 0
+        made = [self.folder / output.path for output in stage.outputs]
+        if not answer_unasked({self.folder / file: keys for file, keys in stage.parameters.items()}, made):
+            with kept(command, cwd=self.folder, env=environment, held=self.held) as process:
+                self._processes.add(process)
+                code = process.wait()
+                self._processes.discard(process)
         missing = [output.path for output in stage.outputs if not (self.folder / output.path).exists()]
         if code or missing:
             return code or 1

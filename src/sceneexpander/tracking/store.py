@@ -338,6 +338,7 @@ def _remove_mirrored(client: Any, experiment: str, record: RunRecord) -> None:
 
 def _record(client: Any, experiment: str, record: RunRecord) -> str:
     from mlflow.entities import Metric, Param
+    from PIL import Image
 
     tags = {**record.tags, KEY_TAG: record.key, _BEGUN_TAG: str(int(time.time())), "mlflow.runName": record.name}
     run = client.create_run(experiment, start_time=record.started_ms, tags=tags, run_name=record.name)
@@ -356,6 +357,10 @@ def _record(client: Any, experiment: str, record: RunRecord) -> str:
     for place, path in sorted(record.artefacts.items()):
         folder, _, _ = place.rpartition("/")
         client.log_artifact(run_id, str(path), folder or None)
+    for name, shots in sorted(record.pictures.items()):
+        for step, path in shots:
+            with Image.open(path) as picture:
+                client.log_image(run_id, picture.convert("RGB"), key=name, step=step, synchronous=True)
     client.set_terminated(run_id, end_time=end)
     client.set_tag(run_id, COMPLETE_TAG, NAMES)
     return run_id

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from sceneexpander.artifacts.unavailable import Unavailable, unavailable_in
 from sceneexpander.pipeline import dvc_adapter
 from sceneexpander.pipeline.__main__ import reproduce
 
@@ -135,3 +136,27 @@ def test_the_lock_file_is_what_dvc_itself_would_write(many: Path) -> None:
 
 def test_no_repository_can_be_used_where_there_is_none(tmp_path: Path) -> None:
     assert not dvc_adapter.can_use_repository(tmp_path)
+
+
+UNASKED = """
+stages:
+  made:
+    matrix: {method: [wanted, unwanted]}
+    cmd: echo ${item.method} >> log && mkdir -p out/${item.method} out/stats && echo '{}' > out/stats/${item.method}.json
+    params: [out/methods.yaml: ["${item.method}"]]
+    outs: ["out/${item.method}", "out/stats/${item.method}.json"]
+"""
+
+
+def test_no_process_starts_for_a_method_that_was_not_asked_for(folder: Path) -> None:
+    (folder / "dvc.yaml").write_text(UNASKED)
+    (folder / "out").mkdir()
+    (folder / "out" / "methods.yaml").write_text("wanted: true\nunwanted: false\n")
+    assert dvc_adapter.reproduce(["--quiet"]) == 0
+    assert (folder / "log").read_text() == "wanted\n"
+    assert unavailable_in(folder / "out" / "unwanted" / "reconstruction") == Unavailable(
+        method="unwanted", model="", reason="was not asked for"
+    )
+    (folder / "out" / "methods.yaml").write_text("wanted: true\nunwanted: true\n")
+    assert dvc_adapter.reproduce(["--quiet"]) == 0
+    assert (folder / "log").read_text() == "wanted\nunwanted\n"
