@@ -17,7 +17,7 @@ help: ## What there is
 
 repro: .venv/.stamp ## Run the pipeline on the scenes in params.yaml
 	$(PY) -m stages.check
-	$(PY) -m sceneexpander.repro
+	$(PY) -m sceneexpander.pipeline.repro
 	@echo "report: $(CURDIR)/outputs/report/index.html"
 
 setup: .venv/.stamp ## Make .venv from requirements.lock

@@ -17,7 +17,7 @@ from pathlib import Path
 from sceneexpander.ablation import make_plan
 from sceneexpander.expandbench.run import CellResult, Settings, run
 from sceneexpander.expandbench.studies import TABLE
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 
 FIRST = "paper"
 SCENE, GRADE = "room_1", "mixed_2"

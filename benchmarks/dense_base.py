@@ -4,7 +4,7 @@
 
 Every method gets one scale per scene (the median ratio to the truth). AbsRel is the mean of |depth / truth - 1|, d the share
 of pixels whose ratio to the truth is under 1.25, both over pixels with a surface. Sparse points are simulated (see
-`sceneexpander.frontend.simulated`).
+`sceneexpander.training.simulated`).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ import torch
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, dense_depth
-from sceneexpander.frontend.simulated import perturb_poses, sample_sparse_points
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 from sceneexpander.synthetic import make_views
+from sceneexpander.training.simulated import perturb_poses, sample_sparse_points
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,7 @@ import torch
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import camera_vector_from_pose, intrinsics_from_parts
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.rigid import look_at
 from sceneexpander.optimisation.config import DensityConfig, OptimiseConfig
@@ -59,7 +60,7 @@ def scene(count: int) -> tuple[Reconstruction, torch.Tensor]:
     poses = look_at(eyes, targets, torch.tensor([0.0, -1.0, 0.0]))
     one = torch.ones(VIEWS)
     intrinsics = intrinsics_from_parts(FOCAL * one, FOCAL * one, one * WIDTH / 2, one * HEIGHT / 2)
-    seen = render(gaussians, poses, intrinsics, HEIGHT, WIDTH)
+    seen = render(gaussians, Cameras(poses, intrinsics, HEIGHT, WIDTH))
     depth = seen.depth.clamp(min=0.1)
     normals = torch.zeros(VIEWS, HEIGHT, WIDTH, 3)
     normals[..., 2] = -1

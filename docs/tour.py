@@ -26,6 +26,7 @@ from sceneexpander.expansion import (
     load_model,
 )
 from sceneexpander.generation import GenerationContext, check_round
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.ingest import load_scene
 from sceneexpander.splatting import render
 from sceneexpander.splatting.ply import write_ply
@@ -73,7 +74,7 @@ def main(folder: Path, overrides: Sequence[str]) -> None:
     for name, scene in (("backbone", backbone), ("expanded", expanded)):
         height, width = scene.depth.shape[1:]
         with torch.no_grad():
-            seen = render(scene.gaussians, scene.world_from_cam, scene.intrinsics_px, height, width)
+            seen = render(scene.gaussians, Cameras(scene.world_from_cam, scene.intrinsics_px, height, width))
         for view, image in zip(scene.view_ids, seen.rgb, strict=True):
             save_png(folder / f"{name}_{view}.png", image.clamp(0, 1))
 

@@ -31,7 +31,7 @@ from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.rank import rank_candidates
 from sceneexpander.ingest.fit import fit_picture
 from sceneexpander.photometric.fitting import fit_to_views
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 
 GRADES = "mixed_1,mixed_2,mixed_4,stretch_8,zoom_10,hallucinate"
 # What an expansion is judged by, and whether more of it is better.

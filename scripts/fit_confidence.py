@@ -7,19 +7,19 @@ The default takes about half an hour on two cores; the training buffer of `train
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 import numpy as np
 from rich.progress import track
 
 from sceneexpander.errors import UserError, entry_point
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.frontend.confidence import FEATURES, RIGHT
 from sceneexpander.frontend.confidence import __file__ as module_file
-from sceneexpander.models.mini.training.buffer import sample_path, samples_folder
-from sceneexpander.models.mini.training.confidence import calibration, fit_confidence, pixels_of_sample
-from sceneexpander.models.mini.training.generate import GeneratorConfig, training_sample
-from sceneexpander.models.mini.training.sample import Sample
+from sceneexpander.training.buffer import sample_path, samples_folder
+from sceneexpander.training.confidence import calibration, fit_confidence, pixels_of_sample
+from sceneexpander.training.generate import GeneratorConfig, training_sample
+from sceneexpander.training.sample import Sample
 
 EVERY_PIXEL = 97  # of which one is used; neighbours say the same
 LEFT_OUT = 5  # every fifth scene is for the check alone
@@ -63,9 +63,7 @@ def main() -> None:
     print("probability   right   share of pixels")
     for probability, right, share in calibration(fitted(features), np.abs(error) < RIGHT):
         print(f"{probability:11.3f}  {right:6.3f}  {share:16.3f}")
-    scratch = arguments.out.with_suffix(f".{os.getpid()}.partial")
-    scratch.write_text(fitted.as_json())
-    os.replace(scratch, arguments.out)
+    write_bytes_atomic(arguments.out, (fitted.as_json()).encode())
 
 
 if __name__ == "__main__":

@@ -24,8 +24,9 @@ from pathlib import Path
 
 from gpu_findings import Finding, Outcome, Status, read_findings
 
-from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.errors import UserError, entry_point
+from sceneexpander.files import write_bytes_atomic
 
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = "gpu-check/1"

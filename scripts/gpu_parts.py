@@ -42,12 +42,12 @@ from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Reconstruct
 from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
 from sceneexpander.optimisation.config import DensityConfig, OptimiseConfig
 from sceneexpander.optimisation.optimise import optimise
+from sceneexpander.pipeline.processes import end_with_parent
+from sceneexpander.pipeline.selection import Selection
 from sceneexpander.pipeline.workspace import make_workspace, workspace_environment
 from sceneexpander.plan import Question, request_of
 from sceneexpander.planning import Meter, PlanRequest, adaptation_cost, inference_cost
 from sceneexpander.planning.simulate import AllHeads
-from sceneexpander.processes import end_with_parent
-from sceneexpander.selection import Selection
 from sceneexpander.splatting import RasterSettings, rasterise
 from sceneexpander.splatting.settings import Backend
 

@@ -9,8 +9,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.errors import entry_point
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.plan import Question, answer
 
 VIEWS = (2, 3, 5, 9, 17, 25, 32)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -23,8 +22,14 @@ from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.models.mini import Mini
-from sceneexpander.models.mini.training.scores import (
+from sceneexpander.models.weights import resolve_weights
+from sceneexpander.photometric.config import WarmupConfig
+from sceneexpander.photometric.report import FitReport
+from sceneexpander.photometric.warmup import warm_up
+from sceneexpander.pipeline.project import find_project
+from sceneexpander.training.scores import (
     HEIGHT,
     INPUTS,
     WIDTH,
@@ -34,11 +39,6 @@ from sceneexpander.models.mini.training.scores import (
     scene_samples,
     score_samples,
 )
-from sceneexpander.models.weights import resolve_weights
-from sceneexpander.photometric.config import WarmupConfig
-from sceneexpander.photometric.report import FitReport
-from sceneexpander.photometric.warmup import warm_up
-from sceneexpander.project import find_project
 
 FIRST_SEED = 800_001  # of the held-out stream; training and validation draw from others
 
@@ -145,10 +145,7 @@ def main() -> None:
         "torch": torch.__version__,
         "rows": [asdict(bar) | {"met": bar.met} for bar in table],
     }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    scratch = arguments.out.with_suffix(f".{os.getpid()}.partial")
-    scratch.write_text(json.dumps(report, indent=1) + "\n")
-    os.replace(scratch, arguments.out)
+    write_bytes_atomic(arguments.out, (json.dumps(report, indent=1) + "\n").encode())
     for bar in table:
         verdict = {True: "met", False: "MISSED", None: ""}[bar.met]
         demand = "" if bar.demand is None else f"demand {bar.demand:g}"

@@ -24,7 +24,7 @@ from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.misalignment import Misaligned, report_misalignment
 from sceneexpander.ingest.fit import fit_picture
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 
 GRADES = "clean,stretch_4,stretch_8,zoom_10,zoom_20,shift_5,mixed_2,hallucinate"
 

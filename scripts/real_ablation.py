@@ -30,9 +30,10 @@ from sceneexpander.expansion import (
     joint_reconstruction,
 )
 from sceneexpander.generation import GenerationContext, check_round
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.ingest import load_scene
 from sceneexpander.photometric.fitting import fit_to_views
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 
@@ -53,7 +54,9 @@ def line(name: str, reconstruction: Reconstruction, views: ViewSet) -> str:
 def pictures(reconstruction: Reconstruction, path: Path) -> None:
     """All views as the reconstruction shows them, in a row."""
     height, width = reconstruction.depth.shape[1:]
-    shown = render(reconstruction.gaussians, reconstruction.world_from_cam, reconstruction.intrinsics_px, height, width)
+    shown = render(
+        reconstruction.gaussians, Cameras(reconstruction.world_from_cam, reconstruction.intrinsics_px, height, width)
+    )
     save_png(path, torch.cat(list(shown.rgb), dim=-1))
 
 

@@ -23,10 +23,11 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.sizes import at_sizes
 from sceneexpander.expansion import initial_state
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.ingest import load_scene
 from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.refine import refine
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.reconstruction.loaded import load_model
 from sceneexpander.splatting import render
 
@@ -44,7 +45,7 @@ def shown(reconstruction: Reconstruction, views: ViewSet, view: int) -> float:
     """PSNR of one photo at the stored size over the pixels that are covered."""
     one = slice(view, view + 1)
     cameras = reconstruction.world_from_cam[one], reconstruction.intrinsics_px[one]
-    seen = render(reconstruction.gaussians, *cameras, views.height, views.width)
+    seen = render(reconstruction.gaussians, Cameras(*cameras, views.height, views.width))
     return psnr(seen.rgb[0], views.images[view], seen.alpha[0] > COVERED)
 
 

@@ -20,15 +20,15 @@ from omegaconf import DictConfig, OmegaConf
 from sceneexpander.artifacts.page import flatten
 from sceneexpander.errors import entry_point
 from sceneexpander.models.mini import Mini, MiniConfig
-from sceneexpander.models.mini.training.buffer import fill_buffer, sample_path, stored_indices
-from sceneexpander.models.mini.training.generate import GeneratorConfig, training_sample
-from sceneexpander.models.mini.training.sample import Sample
-from sceneexpander.models.mini.training.trainer import LossWeights, TrainConfig, Trainer
 from sceneexpander.models.weights import resolve_weights
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.curve import CurveRun
 from sceneexpander.tracking.record import run_key
+from sceneexpander.training.buffer import fill_buffer, sample_path, stored_indices
+from sceneexpander.training.generate import GeneratorConfig, training_sample
+from sceneexpander.training.sample import Sample
+from sceneexpander.training.trainer import LossWeights, TrainConfig, Trainer
 
 MIN_SAMPLES = 40  # in the buffer before training starts
 

@@ -13,7 +13,7 @@ from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.live import LiveLog
 from sceneexpander.artifacts.state import ExpansionState, load_priors
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import (
     CorrectionsConfig,
@@ -25,8 +25,9 @@ from sceneexpander.expansion import (
     judge_round,
     load_model,
 )
+from sceneexpander.files import directory_being_written
 from sceneexpander.photometric.config import RefineConfig
-from sceneexpander.progress import progress_bar
+from sceneexpander.pipeline.progress import progress_bar
 from stages import layout
 from stages.machine import use_machine
 from stages.runner import Cell, checkpoint_folder, live_folder, remove_checkpoints, remove_folder, run_identity, stage

@@ -8,7 +8,7 @@ from sceneexpander.config.overrides import written_out
 from sceneexpander.errors import entry_point
 from sceneexpander.pipeline.packages import installed_packages
 from sceneexpander.pipeline.preflight import Checked, check_scene
-from sceneexpander.selection import read_selection
+from sceneexpander.pipeline.selection import read_selection
 from stages import layout
 from stages.resolve import CONF
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sceneexpander.artifacts.candidates import CandidateSet
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.views import save_png
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.generation import ChoiceConfig, choose_view
 from sceneexpander.judge import JudgeConfig, make_judge
-from sceneexpander.project import JUDGED_FOLDER
+from sceneexpander.pipeline.project import JUDGED_FOLDER
 from stages import layout
 from stages.machine import use_machine
 from stages.rounds import generation_context, scene_so_far

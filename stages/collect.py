@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sceneexpander.artifacts.page import flatten
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_yaml, write_yaml
+from sceneexpander.files import directory_being_written
+from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene
-from sceneexpander.selection import Selection, read_selection
 from stages import layout
 from stages.resolve import read_overrides
 from stages.runner import Cell, stage

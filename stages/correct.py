@@ -8,7 +8,7 @@ from sceneexpander.adaptation.config import AdaptConfig
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.state import ExpansionState, load_priors
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.expansion import (
     CorrectionsConfig,
@@ -18,6 +18,7 @@ from sceneexpander.expansion import (
     compose_procedure,
     load_model,
 )
+from sceneexpander.files import directory_being_written
 from sceneexpander.photometric.config import RefineConfig
 from stages import layout
 from stages.machine import use_machine

@@ -46,7 +46,6 @@ def main(cell: Cell) -> None:
     from sceneexpander.artifacts.truth import SceneTruth
     from sceneexpander.artifacts.views import ViewSet
     from sceneexpander.evaluation.evaluate import evaluate
-    from sceneexpander.evaluation.measure import Navigation
     from sceneexpander.evaluation.repeats import over_repeats
     from stages.machine import use_machine
 
@@ -64,12 +63,7 @@ def main(cell: Cell) -> None:
             scene=cell.scene,
             round_number=cell.round,
             seed=sections.seed,
-            navigation=Navigation(
-                world_from_cam=renders.world_from_cam,
-                intrinsics_px=renders.intrinsics_px,
-                height=renders.height,
-                width=renders.width,
-            ),
+            navigation=renders.cameras,
             truth=truth if truth.views else None,
             fit=fit_of(cell),
         )

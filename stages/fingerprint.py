@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sceneexpander.artifacts.store import write_json_atomic
-from sceneexpander.environment import find_environment
+from sceneexpander.pipeline.environment import find_environment
 from sceneexpander.pipeline.fingerprint import SourceTree
 from stages import layout
 from stages.runner import Cell, stage

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.generation import GeneratorConfig, make_generator
 from stages import layout
 from stages.machine import use_machine

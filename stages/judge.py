@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sceneexpander.artifacts.judgement import JudgedRound
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.judge.config import ChatJudgeConfig, JudgeConfig
-from sceneexpander.project import JUDGED_FOLDER
-from sceneexpander.selection import read_selection
+from sceneexpander.pipeline.project import JUDGED_FOLDER
+from sceneexpander.pipeline.selection import read_selection
 from stages import layout
 from stages.runner import Cell, project_root, stage
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable, unavailable_in
 from sceneexpander.catalogue import method_named
 from sceneexpander.config.files import read_sections
 from sceneexpander.errors import UserError
+from sceneexpander.files import directory_being_written
 from sceneexpander.optimisation.config import OptimiseConfig
-from sceneexpander.progress import progress_bar
+from sceneexpander.pipeline.progress import progress_bar
 from stages import layout
 from stages.runner import Cell, checkpoint_folder, left_out, remove_checkpoints, run_identity, stage
 

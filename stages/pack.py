@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.unavailable import passed_on
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from stages import layout
 from stages.runner import Cell, stage
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import ExpansionState
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.fitting import fit_to_views
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model

@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.ingest import IngestConfig, load_scene, recorded_files
 from sceneexpander.ingest.truth import load_truth
 from stages import layout

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from sceneexpander.artifacts.proposals import Proposal, Proposals
 from sceneexpander.artifacts.reconstruction import Reconstruction
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.views import ViewSet, save_png
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.propose import measure_coverage, propose_motions, start_of
 from stages import layout

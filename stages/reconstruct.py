@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 from sceneexpander.artifacts.scene import Scene
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.photometric.config import WarmupConfig
-from sceneexpander.progress import progress_bar
+from sceneexpander.pipeline.progress import progress_bar
 from sceneexpander.reconstruction.cameras import report_cameras
 from sceneexpander.reconstruction.initial import initial_state
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.state import ExpansionState, save_priors
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.fitting import fit_to_views

@@ -7,12 +7,13 @@ from pathlib import Path
 
 from sceneexpander.artifacts.judgement import SCENE_CRITERIA, JudgedRound
 from sceneexpander.artifacts.metrics import MetricsRow, Row, UnavailableRow, load_row
-from sceneexpander.artifacts.store import directory_being_written, write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.table import comparison_table, scene_table
+from sceneexpander.files import directory_being_written, write_bytes_atomic
+from sceneexpander.pipeline.selection import read_selection
 from sceneexpander.report import write_page
 from sceneexpander.report.judged import comparisons_table, judged_table
-from sceneexpander.selection import read_selection
 from stages import layout
 from stages.runner import Cell, stage
 

@@ -11,11 +11,11 @@ from sceneexpander.catalogue.methods import known_methods
 from sceneexpander.config.compose import compose, scene_option
 from sceneexpander.config.files import write_yaml
 from sceneexpander.config.overrides import written_out
-from sceneexpander.environment import usable_cpus
 from sceneexpander.generation.config import ChoiceConfig, GeneratorConfig
 from sceneexpander.judge.config import JudgeConfig
 from sceneexpander.models.weights import named_file
-from sceneexpander.selection import ROUND_SECTIONS, read_selection
+from sceneexpander.pipeline.environment import usable_cpus
+from sceneexpander.pipeline.selection import ROUND_SECTIONS, read_selection
 from sceneexpander.typed import decode_dataclass
 from stages import layout
 from stages.runner import Cell, stage

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_sections
+from sceneexpander.files import directory_being_written
 from sceneexpander.inference.config import NEEDS_CHECKPOINT, RivalsConfig
 from sceneexpander.photometric.config import RefineConfig
 from stages import layout

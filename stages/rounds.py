@@ -6,7 +6,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.state import ExpansionState
 from sceneexpander.generation import GenerationContext, SceneSoFar
-from sceneexpander.project import GENERATED_FOLDER
+from sceneexpander.pipeline.project import GENERATED_FOLDER
 from stages import layout
 from stages.runner import Cell, project_root
 

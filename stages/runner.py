@@ -18,18 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sceneexpander.artifacts.store import (
-    keep_newest,
-    read_json,
-    write_bytes_atomic,
-    write_json_atomic,
-)
+from sceneexpander.artifacts.store import keep_newest, read_json, write_json_atomic
 from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, disk_full, interruptible
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.packages import installed_packages
+from sceneexpander.pipeline.processes import end_with_parent
+from sceneexpander.pipeline.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
 from sceneexpander.pipeline.unasked import write_unasked
-from sceneexpander.processes import end_with_parent
-from sceneexpander.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
 from stages import layout
 
 STAGE_ENV = "DVC_STAGE"  # set by DVC for the commands that it runs

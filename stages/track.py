@@ -13,9 +13,9 @@ from pathlib import Path
 from sceneexpander.artifacts.store import to_plain, write_json_atomic
 from sceneexpander.config.files import read_sections
 from sceneexpander.errors import UserError, disk_full
+from sceneexpander.pipeline.project import SWEEP_ENV
 from sceneexpander.pipeline.recording import RECORDED, Recorded, RecordedScene
-from sceneexpander.project import SWEEP_ENV
-from sceneexpander.selection import read_selection
+from sceneexpander.pipeline.selection import read_selection
 from sceneexpander.tracking import RunRecord, TrackingConfig, record_runs, scene_runs
 from sceneexpander.tracking.server import shown, where_runs_go
 from stages import layout

@@ -16,12 +16,11 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
-from sceneexpander.environment import find_environment
 from sceneexpander.errors import UserError, did_you_mean, entry_point
 from sceneexpander.expandbench.document import Measured, Results, written
 from sceneexpander.expandbench.grades import GRADES, grade_named
@@ -31,8 +30,10 @@ from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, 
 from sceneexpander.expandbench.scenes import DEVELOPMENT, SCENES, TEST
 from sceneexpander.expandbench.studies import BEYOND, CONTROLS, STUDIES, TABLE, Study
 from sceneexpander.expansion import MethodConfig
+from sceneexpander.files import write_bytes_atomic
+from sceneexpander.pipeline.environment import find_environment
 from sceneexpander.pipeline.fingerprint import SourceTree
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 
 GRADES_BY_DEFAULT = ("mixed_2",)
 SPLITS = {"development": DEVELOPMENT, "test": TEST}

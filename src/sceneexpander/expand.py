@@ -24,12 +24,12 @@ from typing import Any
 import yaml
 
 from sceneexpander.artifacts.inserted import InsertedView
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point, printable
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.generation import Forecast, backend_of
 from sceneexpander.ingest import IngestConfig, make_round, read_picture, safe_name, scene_files
 from sceneexpander.ingest.sources import read_capture
@@ -37,12 +37,12 @@ from sceneexpander.ingest.sources.posed import write_posed_photos
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import check_scene
+from sceneexpander.pipeline.processes import ended_by_signals
+from sceneexpander.pipeline.project import find_project
+from sceneexpander.pipeline.selection import Selection, check_name, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, reproduce
 from sceneexpander.plainfiles import require_plain_file
-from sceneexpander.processes import ended_by_signals
-from sceneexpander.project import find_project
 from sceneexpander.report.cameras import camera_lines
-from sceneexpander.selection import Selection, check_name, read_selection
 
 NO_PICTURE = "give one --inserted PICTURE for each round, or have them made: --generator reproject, openai, ..."
 SCENE_FILE = "scene.yaml"

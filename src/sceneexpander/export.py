@@ -9,7 +9,7 @@ from pathlib import Path
 from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import UserError, did_you_mean, entry_point
 from sceneexpander.exports.formats import FORMATS, check_formats
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 
 DEFAULT_METHOD = "sceneexpander"
 _PARTS = ("all", "generated", "captured")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import UserError, entry_point
-from sceneexpander.project import LIVE_FOLDER, find_project
+from sceneexpander.pipeline.project import LIVE_FOLDER, find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.follow import Follower
 from sceneexpander.tracking.store import describe_experiments

@@ -21,7 +21,7 @@ from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.metrics import MetricsRow, load_row
 from sceneexpander.artifacts.page import ScenePage
 from sceneexpander.artifacts.proposals import Proposals
-from sceneexpander.artifacts.store import ArtifactError, write_bytes_atomic
+from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.catalogue import MAIN
 from sceneexpander.catalogue.methods import CAPTURED
 from sceneexpander.config.compose import compose
@@ -39,14 +39,15 @@ from sceneexpander.expand import (
     inserted_name,
     scratch_folder,
 )
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.generation import backend_of
 from sceneexpander.ingest import make_round, read_picture
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.locks import RunLock, run_lock
 from sceneexpander.pipeline.preflight import check_scene
+from sceneexpander.pipeline.selection import MOST_ROUNDS, PARAMS, Selection, check_name, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, reproduce
 from sceneexpander.plainfiles import require_plain_file
-from sceneexpander.selection import MOST_ROUNDS, PARAMS, Selection, check_name, read_selection
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

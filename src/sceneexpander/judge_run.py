@@ -21,9 +21,9 @@ from sceneexpander.config.overrides import key_of, written_out
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point
+from sceneexpander.pipeline.project import JUDGED_FOLDER, find_project
+from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.plainfiles import require_folder
-from sceneexpander.project import JUDGED_FOLDER, find_project
-from sceneexpander.selection import Selection, read_selection
 
 if TYPE_CHECKING:
     from sceneexpander.artifacts.judgement import JudgedRound
@@ -172,7 +172,7 @@ def agree(requests: int, *, unattended: bool) -> None:
 
 
 def _save(judged: JudgedRound, judge: Judge) -> None:
-    from sceneexpander.artifacts.store import directory_being_written
+    from sceneexpander.files import directory_being_written
 
     with directory_being_written(Path("judged") / judged.scene / f"round_{judged.round}") as folder:
         judged.save(folder, judge.chat.requests)

@@ -12,9 +12,9 @@ from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.errors import UserError, did_you_mean, entry_point
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.planning import PlanRequest, adaptation_cost, inference_cost
 from sceneexpander.planning.models import planned_model
-from sceneexpander.project import find_project
 from sceneexpander.typed import shorten
 
 KEYS = ("model", "views", "width", "height", "options", "tflops")

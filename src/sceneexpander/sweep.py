@@ -26,11 +26,11 @@ from sceneexpander.errors import EXIT_BAD_INPUT, UserError, did_you_mean, disk_f
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import CHECKED_SECTIONS, Checked, check_scene
+from sceneexpander.pipeline.processes import run_group
+from sceneexpander.pipeline.project import ROOT_ENV, find_project
+from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, reproduce_shared
-from sceneexpander.processes import run_group
-from sceneexpander.project import ROOT_ENV, find_project
 from sceneexpander.report.sweep import SweptJob, write_sweep_page
-from sceneexpander.selection import Selection, read_selection
 from sceneexpander.typed import shorten
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import UserError, entry_point
-from sceneexpander.processes import ended_by_signals, kept
-from sceneexpander.project import LIVE_FOLDER, find_project
+from sceneexpander.pipeline.processes import ended_by_signals, kept
+from sceneexpander.pipeline.project import LIVE_FOLDER, find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.describe import experiment_links
 from sceneexpander.tracking.follow import Follower

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.pipeline.test_pipeline import SMOKE, Project
 from tests.unit.generation.loopback import Service, picture, serving
+from tests.worlds.project import SMOKE, Project
 
 pytestmark = pytest.mark.pipeline
 

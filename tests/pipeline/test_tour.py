@@ -17,7 +17,8 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.pipeline
 @pytest.mark.timeout(1200)
 def test_the_tour_expands_the_bundled_scene(tmp_path: Path) -> None:
-    subprocess.run([sys.executable, "docs/tour.py", str(tmp_path / "out"), "profile=smoke"], cwd=ROOT, check=True)
+    quick = ["profile=smoke", "frontend.sfm.max_features=1000", "frontend.sfm.learned=never"]
+    subprocess.run([sys.executable, "docs/tour.py", str(tmp_path / "out"), *quick], cwd=ROOT, check=True)
     gaussians = read_ply(tmp_path / "out" / "gaussians.ply")
     assert 0 < gaussians.generated.float().mean() < 0.5
     for name in ("backbone", "expanded"):

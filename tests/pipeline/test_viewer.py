@@ -17,6 +17,7 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import save_png
 from sceneexpander.geometry.camera import camera_vector_from_pose, unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, concatenate, sh_from_rgb
 from sceneexpander.geometry.rigid import look_at, quat_wxyz_from_rotation
 from sceneexpander.splatting import render
@@ -96,9 +97,11 @@ def ours(
 ) -> Tensor:
     seen = render(
         scene.gaussians,
-        scene.world_from_cam[view : view + 1],
-        scene.intrinsics_px[view : view + 1] if lens is None else lens[None],
-        *size,
+        Cameras(
+            scene.world_from_cam[view : view + 1],
+            scene.intrinsics_px[view : view + 1] if lens is None else lens[None],
+            *size,
+        ),
         background=torch.full((3,), BACKGROUND),
     )
     rgb = seen.rgb[0].clamp(0, 1)

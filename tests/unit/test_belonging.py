@@ -13,12 +13,12 @@ import pytest
 
 from sceneexpander.catalogue import METHODS, Kind
 from sceneexpander.catalogue.methods import methods_of
-from sceneexpander.environment import Environment
 from sceneexpander.errors import UserError
 from sceneexpander.pipeline import packages
+from sceneexpander.pipeline.environment import Environment
 from sceneexpander.pipeline.fingerprint import SourceTree
 from sceneexpander.pipeline.packages import LOCKS, installed_packages
-from sceneexpander.selection import ROUND_SECTIONS, Selection
+from sceneexpander.pipeline.selection import ROUND_SECTIONS, Selection
 from stages import layout, runner
 from stages.fingerprint import stage_names
 from stages.resolve import link_files, named_files

@@ -13,7 +13,7 @@ from sceneexpander.expand import parse_arguments, stage_scene
 from sceneexpander.ingest import load_scene
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.pipeline.preflight import check_scene
-from tests.unit.ingest.test_survey import photos, texture
+from tests.worlds.photos import photos, texture
 
 pytestmark = pytest.mark.timeout(60)
 CONF = Path(__file__).parents[2] / "conf"

@@ -12,15 +12,12 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from PIL import Image
 
 from sceneexpander import expand as command
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
@@ -31,22 +28,11 @@ from sceneexpander.generation import Forecast
 from sceneexpander.pipeline import preflight
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import CheckedScene
-from sceneexpander.selection import read_selection
-from tests.unit.ingest.test_survey import texture
+from sceneexpander.pipeline.selection import read_selection
+from tests.worlds.expansions import ROOT, everything, photos, picture, project, request, somebody_at_work
 
-ROOT = Path(__file__).parents[2]
-
-
-def picture(path: Path, shade: int = 40) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (40, 30), (shade, 90, 200 - shade)).save(path, "PNG")
-    return path
-
-
-def photos(folder: Path) -> Path:
-    for number in range(3):
-        picture(folder / f"{number}.png", 40 * number)
-    return folder
+__all__ = ["project"]  # the fixture
+from tests.worlds.photos import texture
 
 
 def scene(folder: Path) -> Path:
@@ -54,29 +40,6 @@ def scene(folder: Path) -> Path:
     picture(folder / "inserted" / "one.png", 150)
     (folder / "scene.yaml").write_text('name: a\nrounds:\n  - prompt: "A bench."\n    inserted: inserted/one.png\n')
     return folder
-
-
-@pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project whose pipeline does nothing, and whose check looks at the folder only."""
-    folder = tmp_path / "project"
-    for part in ("src", "stages", ".dvc"):
-        (folder / part).mkdir(parents=True)
-        (folder / part / "file").write_text("x")
-    shutil.copytree(ROOT / "conf", folder / "conf")
-    (folder / "params.yaml").write_text((ROOT / "params.yaml").read_text())
-    monkeypatch.setattr(command, "check_scene", lambda *_, **__: CheckedScene(rounds=1))
-    monkeypatch.setattr(command, "reproduce", lambda *_, **__: None)
-    return folder
-
-
-def everything(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def request(source: Path, tmp_path: Path, **more: Any) -> Request:
-    given = {"inserted": (picture(tmp_path / "new.png", 150),), "prompts": ("A bench.",)}
-    return Request(photos=source, **(given | more))
 
 
 def test_the_same_photos_go_on_and_others_are_refused(project: Path, tmp_path: Path) -> None:
@@ -108,22 +71,6 @@ def test_names_of_the_pipelines_own_are_refused(name: str, project: Path, tmp_pa
     with pytest.raises(UserError, match="uses for its own results; choose another --name"):
         expand(request(photos(tmp_path / name), tmp_path), project=project)
     assert not (project / "runs").exists()
-
-
-@contextmanager
-def somebody_at_work(folder: Path) -> Iterator[int]:
-    script = (
-        "import sys, time; from pathlib import Path; from sceneexpander.pipeline.locks import run_lock\n"
-        f"with run_lock(Path({str(folder)!r})): print('at work', flush=True); time.sleep(60)\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    try:
-        assert process.stdout.readline() == "at work\n"
-        yield process.pid
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def test_a_second_start_changes_nothing(project: Path, tmp_path: Path) -> None:
@@ -166,7 +113,7 @@ def test_a_killed_start_leaves_no_child_and_no_lock(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     script = f"""
 from pathlib import Path
-from sceneexpander.processes import kept
+from sceneexpander.pipeline.processes import kept
 from sceneexpander.pipeline.locks import run_lock
 with run_lock(Path({str(folder)!r})) as lock:
     with kept(["sleep", "60"], cwd=Path({str(tmp_path)!r}), held=(lock.descriptor,)) as process:

@@ -17,9 +17,9 @@ from sceneexpander.expand import expand, parse_arguments, read_arguments
 from sceneexpander.generation import Forecast
 from sceneexpander.growing import RoundRequest, add_round, proposal_lines, quality_line, undo_round
 from sceneexpander.pipeline.preflight import CheckedScene
-from sceneexpander.selection import read_selection
-from tests.unit.report.test_page import view
-from tests.unit.test_expand import everything, photos, picture, project, request, somebody_at_work
+from sceneexpander.pipeline.selection import read_selection
+from tests.worlds.expansions import everything, photos, picture, project, request, somebody_at_work
+from tests.worlds.reports import view
 
 __all__ = ["project"]
 

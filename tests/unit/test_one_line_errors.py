@@ -23,8 +23,8 @@ from sceneexpander.optimisation.splats import Splats
 from sceneexpander.pipeline.preflight import check_scene
 from sceneexpander.tracking.store import KEY_TAG, database_path, last_experiment
 from tests.support.tiny_model import TinyReconstructor
-from tests.unit.artifacts.test_artifacts import make_views
-from tests.unit.splatting.scenes import random_gaussians
+from tests.worlds.artifacts import make_views
+from tests.worlds.random_gaussians import random_gaussians
 
 ROOT = Path(__file__).parents[2]
 

@@ -15,7 +15,7 @@ from sceneexpander import ablation, sweep, ui
 from sceneexpander.artifacts.store import to_plain, write_json_atomic
 from sceneexpander.errors import UserError
 from sceneexpander.expandbench.run import CellResult, Plan, Settings
-from sceneexpander.selection import Selection
+from sceneexpander.pipeline.selection import Selection
 from sceneexpander.sweep import check_axes, run_hydra
 
 ROOT = Path(__file__).parents[2]
@@ -206,7 +206,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     "given",
     [
-        ["--finished", "--study", "predicted"],
+        ["--finished", "--rows", "default"],
         ["--rows", ""],
         ["--rows", ","],
         ["--seeds", ""],
@@ -247,7 +247,7 @@ def test_a_port_in_use_is_one_line() -> None:
 
 
 def test_a_root_that_is_none_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sceneexpander.project import find_project
+    from sceneexpander.pipeline.project import find_project
 
     monkeypatch.setenv("SCENEEXPANDER_ROOT", str(tmp_path / "gone"))
     with pytest.raises(UserError, match=r"SCENEEXPANDER_ROOT=.* holds no pipeline"):

@@ -20,6 +20,7 @@ from sceneexpander.adaptation.engine import autocast
 from sceneexpander.adaptation.inputs import ViewSource
 from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.sampling import Batch
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.models.protocol import ALL_HEADS
 from sceneexpander.splatting import render
 
@@ -62,7 +63,7 @@ class Observer:
         placed = list(range(count)) if posed is None or not bool(posed.any()) else torch.nonzero(posed)[:, 0].tolist()
         chosen = [*(placed[index] for index in spread(len(placed), LOOKED_AT)), count]
         drawn = render(
-            gaussians, prediction.world_from_cam[chosen], prediction.intrinsics_px[chosen], height, width
+            gaussians, Cameras(prediction.world_from_cam[chosen], prediction.intrinsics_px[chosen], height, width)
         ).rgb.clamp(0, 1)
         quality = [psnr_db(picture, views.images[view]) for picture, view in zip(drawn, chosen, strict=True)]
         if self.folder is not None:

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.geometry.agreement import agreement
-from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.models.protocol import Prediction
 
 
@@ -29,9 +28,9 @@ def inserted_weights(
     count = len(anchored_depth)
     if prediction.depth is None:
         raise ValueError("the weights need the depth head")
-    poses, intrinsics = prediction.world_from_cam, prediction.intrinsics_px
-    points = unproject_to_world(prediction.depth[count:], intrinsics[count:], poses[count:])[0]
-    weight = agreement(points, anchored_depth, poses[:count], intrinsics[:count]).weight
+    cameras = prediction.cameras_of(*prediction.depth.shape[1:])
+    points = cameras[count:].unproject(prediction.depth[count:])[0]
+    weight = agreement(points, anchored_depth, cameras[:count]).weight
     if prediction.depth_conf is not None:
         weight = weight * confidence_weight(prediction.depth_conf[count])
     return (weight / weight.mean().clamp(min=1e-6))[None]

@@ -17,9 +17,9 @@ from sceneexpander.artifacts.store import (
     refusing,
     save_artifact,
     sha256_of_bytes,
-    write_bytes_atomic,
     write_json_atomic,
 )
+from sceneexpander.files import write_bytes_atomic
 
 SCHEMA = "candidates/1"
 Ending = Literal["candidate", "refused", "failed_retryable", "failed_final"]

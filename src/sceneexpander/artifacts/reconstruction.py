@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneexpander.artifacts.store import load_artifact, load_fields, refusing, save_artifact
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import ROWS, GaussianCounts, Gaussians
 
 SCHEMA = "reconstruction/1"
@@ -50,6 +51,12 @@ class Reconstruction:
                 raise ValueError(f"Reconstruction.{name} is not finite in view {view} ({self.view_ids[view]})")
         if not bool((self.depth > 0).all()):
             raise ValueError("Reconstruction.depth must be positive everywhere")
+
+    @property
+    def cameras(self) -> Cameras:
+        """Of all views."""
+        height, width = (int(side) for side in self.depth.shape[1:])
+        return Cameras(self.world_from_cam, self.intrinsics_px, height, width)
 
     def save(self, folder: Path) -> None:
         """Write into a (scratch) folder."""

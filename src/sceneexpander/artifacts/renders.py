@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.artifacts.store import ArtifactError, check_inside, load_artifact, load_fields, save_artifact
+from sceneexpander.geometry.cameras import Cameras
 
 SCHEMA = "renders/1"
 _TENSORS = ("world_from_cam", "intrinsics_px")
@@ -49,6 +50,11 @@ class Renders:
     scene: str
     world_from_cam: Float[Tensor, "frame 4 4"]
     intrinsics_px: Float[Tensor, "frame 3 3"]
+
+    @property
+    def cameras(self) -> Cameras:
+        """The tour."""
+        return Cameras(self.world_from_cam, self.intrinsics_px, self.height, self.width)
 
     def save(self, folder: Path) -> None:
         """Write the facts beside the files. Raises `ArtifactError` if one of them is missing."""

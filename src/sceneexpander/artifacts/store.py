@@ -1,6 +1,5 @@
-"""How artefacts reach the disk: whole or not at all.
+"""How artefacts are held on disk: a folder of small facts and tensors, written whole (`sceneexpander.files`).
 
-A directory artefact is written under a scratch name beside its target, synced, and renamed; a reader therefore never sees half of one.
 ``artifact.json`` (small facts and the schema name) is the last file written into it and its presence marks the artefact.
 
 torch is imported only where tensors are: stages that move small facts start in a tenth of the time.
@@ -10,15 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import glob
 import hashlib
 import json
 import logging
-import os
 import shutil
 import types
 import typing
-import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
@@ -27,6 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from safetensors import SafetensorError
 
 from sceneexpander.errors import UserError
+from sceneexpander.files import recover_directory, write_bytes_atomic
 from sceneexpander.typed import REFUSALS, DecodeError, decode, decode_dataclass, describe, fields_of, shorten
 
 if TYPE_CHECKING:
@@ -42,28 +39,6 @@ _log = logging.getLogger(__name__)
 
 class ArtifactError(UserError):
     """An artefact on disk is missing, damaged, or of another kind or schema version."""
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def write_bytes_atomic(path: Path, data: bytes) -> None:
-    """Write a file so that readers see either the old bytes or all of the new ones."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
-    try:
-        with scratch.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)
 
 
 def write_json_atomic(path: Path, content: object) -> None:
@@ -126,34 +101,6 @@ def to_plain(value: object) -> Any:
     if isinstance(value, Path):
         return str(value)
     return value
-
-
-@contextlib.contextmanager
-def directory_being_written(target: Path) -> Iterator[Path]:
-    """Yield a scratch directory that becomes ``target`` (replacing it) only if the block ends without an error.
-
-    What a killed writer of the same target left is cleared first: a target has one writer at a time.
-    """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    _tidy(target)
-    scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
-    scratch.mkdir()
-    try:
-        yield scratch
-        for path in sorted(scratch.rglob("*")):
-            _sync(path)
-        _sync(scratch)
-        if target.exists():
-            old = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.old")
-            target.rename(old)
-            scratch.rename(target)
-            shutil.rmtree(old)
-        else:
-            scratch.rename(target)
-        _sync(target.parent)
-    finally:
-        if scratch.exists():
-            shutil.rmtree(scratch)
 
 
 def save_artifact(folder: Path, schema: str, facts: Mapping[str, object], tensors: Mapping[str, Tensor]) -> None:
@@ -279,7 +226,7 @@ def load_resume_point(
         run_key: of the run that is to go on.
         build: from facts and tensors; whatever it says about values that are none makes the artefact a damaged one.
     """
-    _tidy(folder)
+    recover_directory(folder)
     if not folder.exists():
         return None
     try:
@@ -338,16 +285,3 @@ def _byte_dtype() -> Any:
     import torch
 
     return torch.uint8
-
-
-def _tidy(folder: Path) -> None:
-    """Clear what a killed writer left: half a new folder, or the old one already moved aside (which is whole)."""
-    name = f".{glob.escape(folder.name)}.{'[0-9a-f]' * 8}"
-    for old in folder.parent.glob(f"{name}.old"):
-        if folder.exists():
-            shutil.rmtree(old)
-        else:
-            old.rename(folder)
-    for scratch in folder.parent.glob(f"{name}.part"):
-        if scratch.is_dir():
-            shutil.rmtree(scratch)

@@ -5,14 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneexpander.artifacts.store import (
-    FACTS_NAME,
-    directory_being_written,
-    load_artifact,
-    read_json,
-    read_typed,
-    save_artifact,
-)
+from sceneexpander.artifacts.store import FACTS_NAME, load_artifact, read_json, read_typed, save_artifact
+from sceneexpander.files import directory_being_written
 
 SCHEMA = "unavailable/1"
 

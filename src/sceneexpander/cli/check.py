@@ -9,7 +9,7 @@ from importlib import import_module
 
 from sceneexpander.commandline import CommandParser
 from sceneexpander.errors import entry_point
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 
 
 def make_parser() -> CommandParser:

@@ -40,7 +40,9 @@ COMMANDS = (
         "compare with recorded outputs of reference implementations",
     ),
     Command(
-        "convert", "sceneexpander.convert_checkpoint", "convert a PyTorch checkpoint to safetensors, running no code"
+        "convert",
+        "sceneexpander.convert_checkpoint",
+        "convert a PyTorch checkpoint to safetensors, running no code",
     ),
     Command("check", "sceneexpander.cli.check", "look at params.yaml, conf/, photos and weights; run nothing"),
     Command(

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import yaml
 
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.config.parse import ConfigError, parse_dataclass
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.typed import shorten
 
 T = TypeVar("T")

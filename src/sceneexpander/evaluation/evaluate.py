@@ -15,10 +15,11 @@ from sceneexpander.catalogue import register
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.earlier import EarlierRegions
-from sceneexpander.evaluation.measure import Measure, Navigation, Subject, Values, known_values
+from sceneexpander.evaluation.measure import Measure, Subject, Values, known_values
 from sceneexpander.evaluation.sizes import AtOtherSizes
 from sceneexpander.evaluation.truth import TruthMetrics, against_truth
 from sceneexpander.evaluation.views import AtStoredSize, FromOthers, TourCoverage, measure_views
+from sceneexpander.geometry.cameras import Cameras
 
 
 class Counts(Measure):
@@ -77,7 +78,7 @@ def evaluate(
     scene: str,
     round_number: int,
     seed: int,
-    navigation: Navigation | None = None,
+    navigation: Cameras | None = None,
     truth: SceneTruth | None = None,
     fit: Fit = Fit.PREDICTED,
 ) -> MetricsRow:

@@ -18,19 +18,10 @@ from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.catalogue import Metric
 from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import Render
 
 Values = Mapping[str, float | None]  # by names of the catalogue; None: not defined here
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Navigation:
-    """Frames of a camera path, in the frame of the reconstruction that is evaluated."""
-
-    world_from_cam: Float[Tensor, "frame 4 4"]
-    intrinsics_px: Float[Tensor, "frame 3 3"]
-    height: int
-    width: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +60,7 @@ class Subject:
     views: ViewSet
     round_number: int
     config: EvaluateConfig
-    navigation: Navigation | None = None
+    navigation: Cameras | None = None
     truth: SceneTruth | None = None
 
 

@@ -20,6 +20,7 @@ from sceneexpander.evaluation.image import WINDOW, psnr, ssim
 from sceneexpander.evaluation.measure import Measure, SeenView, Values
 from sceneexpander.evaluation.perceptual import st_lpips
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import render
 
 OPEN_ALPHA = 0.9  # below it one looks through a surface
@@ -95,7 +96,9 @@ def _at_size(
     stored_height, stored_width = reconstruction.depth.shape[1:]
     height, width = size
     lens = resize_intrinsics(reconstruction.intrinsics_px[index], width / stored_width, height / stored_height)
-    seen = render(reconstruction.gaussians, reconstruction.world_from_cam[index][None], lens[None], height, width)
+    seen = render(
+        reconstruction.gaussians, Cameras(reconstruction.world_from_cam[index][None], lens[None], height, width)
+    )
     shown = None
     if valid is not None:
         shown = functional.interpolate(valid[None, None].to(photo), size=size, mode="nearest")[0, 0] > 0

@@ -25,6 +25,7 @@ from sceneexpander.evaluation.image import psnr, ssim
 from sceneexpander.evaluation.measure import Measure, SeenView, Subject, Values, known_values
 from sceneexpander.evaluation.perceptual import st_lpips
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import align_views
 from sceneexpander.splatting import render
@@ -34,21 +35,13 @@ _FEWEST_PIXELS = 64  # fewer covered pixels say nothing about a picture
 
 @torch.no_grad()
 def navigation_coverage(
-    reconstruction: Reconstruction,
-    world_from_cam: Float[Tensor, "frame 4 4"],
-    intrinsics_px: Float[Tensor, "frame 3 3"],
-    height: int,
-    width: int,
-    config: EvaluateConfig,
+    reconstruction: Reconstruction, path: Cameras, config: EvaluateConfig
 ) -> Float[Tensor, "frame"]:
     """Share of pixels with alpha above the threshold, for each frame of a navigation in the reconstruction's own frame.
 
     Coverage gained by an expansion is the difference of the means after and before, on the same frames: see `same_place`.
     """
-    shares = [
-        render(reconstruction.gaussians, pose[None], intrinsics[None], height, width).alpha[0]
-        for pose, intrinsics in zip(world_from_cam, intrinsics_px, strict=True)
-    ]
+    shares = [render(reconstruction.gaussians, path[frame]).alpha[0] for frame in range(len(path))]
     return (torch.stack(shares) > config.coverage_alpha).to(torch.float32).mean(dim=(1, 2))
 
 
@@ -141,7 +134,7 @@ def see_view(
         picture=picture,
         photo=views.photo(place),
         valid=valid,
-        render=render(reconstruction.gaussians, *camera, *picture.shape[1:]),
+        render=render(reconstruction.gaussians, Cameras(*camera, *picture.shape[1:])),
         config=config,
     )
 
@@ -215,7 +208,7 @@ class FromOthers(Measure):
             return 0.0, None
         whole, index, counted = view.reconstruction, view.index, _counted(view)
         camera = (whole.world_from_cam[index : index + 1], whole.intrinsics_px[index : index + 1])
-        seen = render(others, *camera, *view.picture.shape[1:])
+        seen = render(others, Cameras(*camera, *view.picture.shape[1:]))
         covered = (seen.alpha[0] > view.config.coverage_alpha) & counted
         if int(covered.sum()) < _FEWEST_PIXELS:
             return _share(covered, counted), None
@@ -234,9 +227,7 @@ class TourCoverage(Measure):
         path = subject.navigation
         if path is None:
             return {"tour_frames": 0}
-        frames = navigation_coverage(
-            subject.reconstruction, path.world_from_cam, path.intrinsics_px, path.height, path.width, subject.config
-        )
+        frames = navigation_coverage(subject.reconstruction, path, subject.config)
         return {"tour_covered": float(frames.double().mean()), "tour_frames": len(frames)}
 
 

@@ -17,6 +17,7 @@ from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.expandbench.prepared import placement_in
 from sceneexpander.expandbench.scenes import BenchScene, TrueView
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import render
 
 _COVERED = 0.5  # alpha from which on a pixel counts as drawn
@@ -88,5 +89,5 @@ def picture_at(
     placement = placement_in(reconstruction, scene)
     placed = placement.poses(view.world_from_cam[None].double()).float()
     height, width = view.image.shape[1:]
-    seen = render(reconstruction.gaussians, placed, view.intrinsics_px[None], height, width)
+    seen = render(reconstruction.gaussians, Cameras(placed, view.intrinsics_px[None], height, width))
     return seen.rgb[0], seen.alpha[0], seen.depth[0], float(placement.scale)

@@ -14,11 +14,11 @@ from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.scene import KnownCameras, RoundSpec, Scene
 from sceneexpander.artifacts.state import ExpansionState, load_priors, save_priors
-from sceneexpander.artifacts.store import directory_being_written
 from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.expandbench.grades import Grade
 from sceneexpander.expandbench.scenes import BenchScene
 from sceneexpander.expansion import LoadedModel, RoundInputs, captured_prediction, initial_state
+from sceneexpander.files import directory_being_written
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.gauge import in_gauge_of
 from sceneexpander.geometry.priors import Priors

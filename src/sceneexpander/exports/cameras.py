@@ -24,9 +24,10 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from sceneexpander.artifacts.source_type import MADE_BY_MODEL, source_type_xmp
-from sceneexpander.artifacts.store import write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.exports.points import Points, points_of_depth
 from sceneexpander.exports.scene import ExportScene, ExportView
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rigid_inverse
 
 ABOUT = "about.json"  # the statement, in folders of formats without a place for it

@@ -18,14 +18,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.errors import UserError
 from sceneexpander.exports.gltf import glb_bytes, load_trimesh
 from sceneexpander.exports.scene import ExportScene
 from sceneexpander.exports.statement import Statement
-from sceneexpander.geometry.camera import unproject_to_world
-from sceneexpander.geometry.lookup import project_to_views, sample_at
-from sceneexpander.geometry.rigid import rigid_inverse
+from sceneexpander.files import write_bytes_atomic
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import Render, render
 from sceneexpander.splatting.ply import ply_comment
 
@@ -97,12 +95,11 @@ def _fuse(scene: ExportScene, voxels: int, truncation: float) -> _Field:
     views = [made.view_ids.index(view.view_id) for view in scene.views]
     if not views:
         raise UserError("has no view with a camera", where=scene.statement.scene, fix="a mesh needs one")
-    poses, lenses = made.world_from_cam[views], made.intrinsics_px[views]
-    height, width = made.depth.shape[1:]
+    cameras = made.cameras[views]
     with torch.no_grad():
-        seen = [_look(scene, poses[i], lenses[i], height, width) for i in range(len(views))]
+        seen = [render(made.gaussians, cameras[i]) for i in range(len(views))]
     maps = torch.stack([_maps(one) for one in seen])  # depth (0: none), red green blue, generated
-    origin, voxel, shape = _box(scene, maps, poses, lenses, voxels, truncation)
+    origin, voxel, shape = _box(scene, maps, cameras, voxels, truncation)
     count = int(np.prod(shape))
     distance, weight = torch.zeros(count), torch.zeros(count)
     colour, colours = torch.zeros(count, 4), torch.zeros(count)
@@ -110,12 +107,11 @@ def _fuse(scene: ExportScene, voxels: int, truncation: float) -> _Field:
         rows = torch.arange(start, min(start + _CHUNK, count))
         points = origin + voxel * torch.stack(torch.unravel_index(rows, shape), -1)
         for view in range(len(views)):
-            cam_from_world = rigid_inverse(poses[view : view + 1])
-            grid, z, in_frame = project_to_views(points, cam_from_world, lenses[view : view + 1], height, width)
             # Nearest: between two surfaces there is no depth.
-            found = sample_at(maps[view : view + 1], grid, mode="nearest")[0]
-            ahead = (found[0] - z[0]) / (truncation * voxel)
-            use = in_frame[0] & (found[0] > 0) & (ahead > -1)
+            there, place = cameras[view].look_up(points, maps[view : view + 1], "nearest")
+            found = there[0]
+            ahead = (found[0] - place.depth[0]) / (truncation * voxel)
+            use = place.in_frame[0] & (found[0] > 0) & (ahead > -1)
             trust = torch.where(ahead[use] < 1, 1.0, _FREE)
             distance[rows[use]] += trust * ahead[use].clamp(max=1)
             weight[rows[use]] += trust
@@ -135,10 +131,6 @@ def _fuse(scene: ExportScene, voxels: int, truncation: float) -> _Field:
     )
 
 
-def _look(scene: ExportScene, pose: Tensor, lens: Tensor, height: int, width: int) -> Render:
-    return render(scene.reconstruction.gaussians, pose[None], lens[None], height, width)
-
-
 def _maps(seen: Render) -> Float[Tensor, "5 height width"]:
     """Depth (0: none), red, green, blue, generated."""
     depth, alpha = seen.depth[0], seen.alpha[0]
@@ -154,10 +146,10 @@ def _maps(seen: Render) -> Float[Tensor, "5 height width"]:
 
 
 def _box(
-    scene: ExportScene, maps: Tensor, poses: Tensor, lenses: Tensor, voxels: int, truncation: float
+    scene: ExportScene, maps: Tensor, cameras: Cameras, voxels: int, truncation: float
 ) -> tuple[Float[Tensor, "3"], float, tuple[int, int, int]]:
     """(centre of the first voxel, length of a voxel, number of them along each axis)."""
-    points = unproject_to_world(maps[:, 0].clamp(min=1e-6), lenses, poses)[maps[:, 0] > 0]
+    points = cameras.unproject(maps[:, 0].clamp(min=1e-6))[maps[:, 0] > 0]
     if not len(points):
         fix = "crop less, or export its points"
         raise UserError("covers no view enough for a surface", where=scene.statement.scene, fix=fix)

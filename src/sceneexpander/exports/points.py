@@ -14,8 +14,8 @@ from torch import Tensor
 from sceneexpander.artifacts.views import to_bytes
 from sceneexpander.exports.gltf import glb_bytes, load_trimesh
 from sceneexpander.exports.scene import ExportScene, ExportView
+from sceneexpander.files import complete_file
 from sceneexpander.geometry.camera import pixel_centres, unproject_to_world
-from sceneexpander.splatting.files import complete_file
 
 POINTS_GLB = 300_000
 _LEAST_CONFIDENT = 0.1  # share of each view's pixels that are left out

@@ -21,8 +21,7 @@ from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.exports.statement import GeneratedView, Statement
 from sceneexpander.geometry.camera import camera_vector_from_pose, resize_intrinsics
 from sceneexpander.geometry.gaussians import Gaussians
-from sceneexpander.geometry.lookup import project_to_views, sample_at
-from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rigid_inverse, rotation_from_quat_wxyz
+from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting.torch_backend import sh_basis
 from sceneexpander.viewer.packed import visible_weight
@@ -257,10 +256,7 @@ def _heaviest(weight: Float[Tensor, "gaussian"], count: int) -> Tensor:
 
 def _confidence(gaussians: Gaussians, made: Reconstruction) -> Float[Tensor, "gaussian"]:
     """What the reconstruction's depth confidence is where a Gaussian lies: in its own view, or where that is not known in the best one."""
-    height, width = made.depth.shape[1:]
-    grid, _, in_frame = project_to_views(
-        gaussians.means, rigid_inverse(made.world_from_cam), made.intrinsics_px, height, width
-    )
-    found = sample_at(made.depth_conf[:, None], grid)[:, 0].where(in_frame, made.depth_conf.new_zeros(()))
+    there, place = made.cameras.look_up(gaussians.means, made.depth_conf[:, None])
+    found = there[:, 0].where(place.in_frame, made.depth_conf.new_zeros(()))
     own = found.gather(0, gaussians.source_view.clamp(min=0)[None])[0]
     return torch.where(gaussians.source_view >= 0, own, found.amax(0))

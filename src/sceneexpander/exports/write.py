@@ -6,13 +6,14 @@ import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.exports.cameras import write_cameras_csv, write_cameras_json, write_colmap, write_nerfstudio
 from sceneexpander.exports.formats import FORMATS
 from sceneexpander.exports.maps import write_depth, write_normals
 from sceneexpander.exports.mesh import write_collider, write_mesh
 from sceneexpander.exports.points import write_points
 from sceneexpander.exports.scene import ExportScene
+from sceneexpander.files import directory_being_written
 from sceneexpander.splatting.ply import write_ply
 from sceneexpander.splatting.spz import Version, write_spz
 

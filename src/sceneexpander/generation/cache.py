@@ -14,13 +14,12 @@ from sceneexpander.artifacts.inserted import Provenance
 from sceneexpander.artifacts.store import (
     FACTS_NAME,
     ArtifactError,
-    directory_being_written,
     load_artifact,
     read_typed,
     save_artifact,
     sha256_of_bytes,
-    write_bytes_atomic,
 )
+from sceneexpander.files import directory_being_written, write_bytes_atomic
 from sceneexpander.services.kept import digest_of
 
 SCHEMA = "answer/1"

@@ -54,8 +54,8 @@ def report_misalignment(picture: FittedPicture, so_far: SceneSoFar, *, seed: int
         return Misaligned(report=MisalignmentReport(inliers=registered.inliers, matches=registered.matched))
     found = registered.found
     views = so_far.views
-    pose, intrinsics = registered.camera(found)
-    seen = render(so_far.reconstruction.gaussians, pose[None], intrinsics[None], views.height, views.width)
+    camera = registered.camera(found, views.height, views.width)
+    seen = render(so_far.reconstruction.gaussians, camera)
     own, cover = image_tensor(picture.image), seen.alpha[0] >= _SEEN
     scene = (seen.rgb[0] / seen.alpha[0].clamp(min=_SEEN)).clamp(0, 1)
     gains = tone_gains(own, scene, cover)
@@ -64,7 +64,7 @@ def report_misalignment(picture: FittedPicture, so_far: SceneSoFar, *, seed: int
         inliers=registered.inliers,
         matches=registered.matched,
         reprojection_px=float(np.median(registered.errors_px(found)[found.inlier])),
-        world_from_cam=tuple(tuple(row) for row in pose.tolist()),
+        world_from_cam=tuple(tuple(row) for row in camera.world_from_cam[0].tolist()),
         focal_factor=float(np.exp(found.lens[LOG_FOCAL])),
         stretch=stretch,
         gains=tuple(gains.tolist()),

@@ -18,6 +18,7 @@ from sceneexpander.generation.motion import Direction, Step
 from sceneexpander.generation.protocol import SceneSoFar
 from sceneexpander.generation.start import CENTRAL, gaze_distance, moved_camera, start_view, upwards, view_distances
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rigid_from_parts
 from sceneexpander.splatting.render import Render, render
 
@@ -117,7 +118,9 @@ def measure_coverage(so_far: SceneSoFar) -> Coverage:
     directions = _map_directions(like=basis)
     rgb, alpha = directions.new_zeros(3, *directions.shape[:2]), directions.new_zeros(directions.shape[:2])
     for face in _cube_faces(like=basis):
-        seen = render(scene.gaussians, rigid_from_parts(basis @ face, middle)[None], lens[None], _FACE_PX, _FACE_PX)
+        seen = render(
+            scene.gaussians, Cameras(rigid_from_parts(basis @ face, middle)[None], lens[None], _FACE_PX, _FACE_PX)
+        )
         x, y, z = (directions @ face).unbind(-1)
         inside = (z > 0) & (x.abs() <= z) & (y.abs() <= z)
         column, row = ((half + half * part / z.clamp(min=1e-9)).long().clamp(0, _FACE_PX - 1) for part in (x, y))
@@ -148,7 +151,7 @@ def _drawn(so_far: SceneSoFar, pose: Float[Tensor, "4 4"], view: int, *, long_si
     scale = min(1.0, long_side_px / max(views.height, views.width))
     height, width = round(views.height * scale), round(views.width * scale)
     lens = resize_intrinsics(scene.intrinsics_px[view], width / views.width, height / views.height)
-    return render(scene.gaussians, pose[None], lens[None], height, width)
+    return render(scene.gaussians, Cameras(pose[None], lens[None], height, width))
 
 
 def _preview(so_far: SceneSoFar, pose: Float[Tensor, "4 4"], view: int) -> Float[Tensor, "3 height width"]:

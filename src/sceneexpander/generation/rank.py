@@ -13,6 +13,7 @@ from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.frontend.features import grey_u8
 from sceneexpander.generation.protocol import SceneSoFar
 from sceneexpander.generation.registration import FEWEST_INLIERS, PhotoPoints, detail_of, photo_points, register
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.ingest.fit import FittedPicture
 from sceneexpander.ingest.load import image_tensor
 from sceneexpander.splatting.render import render
@@ -60,7 +61,7 @@ def _score(index: int, picture: FittedPicture, photos: PhotoPoints, so_far: Scen
             reason=f"its camera is not found ({inliers} of {matched} matches agree)",
         )
     registration = min(1.0, inliers / _SURE_INLIERS) * inliers / max(matched, 1)
-    appearance, novelty = _compared(picture, *registered.camera(found), so_far)
+    appearance, novelty = _compared(picture, registered.camera(found, so_far.views.height, so_far.views.width), so_far)
     values = {
         "registration": registration,
         "appearance": appearance,
@@ -82,15 +83,9 @@ def _score(index: int, picture: FittedPicture, photos: PhotoPoints, so_far: Scen
 
 
 @torch.no_grad()
-def _compared(
-    picture: FittedPicture,
-    world_from_cam: Float[Tensor, "4 4"],
-    intrinsics_px: Float[Tensor, "3 3"],
-    so_far: SceneSoFar,
-) -> tuple[float, float]:
+def _compared(picture: FittedPicture, camera: Cameras, so_far: SceneSoFar) -> tuple[float, float]:
     """(likeness to the rendered scene where it has been seen, share of the picture that has not been)."""
-    views, scene = so_far.views, so_far.reconstruction
-    seen = render(scene.gaussians, world_from_cam[None], intrinsics_px[None], views.height, views.width)
+    seen = render(so_far.reconstruction.gaussians, camera)
     cover = seen.alpha[0] >= _SEEN
     novelty = 1 - float(cover.float().mean())
     share = _cells(cover[None].float())[0]

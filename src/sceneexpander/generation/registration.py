@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from sceneexpander.frontend.features import Features, detect_features, grey_u8
 from sceneexpander.frontend.matching import mutual_matches, similarity
@@ -16,6 +15,7 @@ from sceneexpander.frontend.resection import ResectedView, Sighting, point_error
 from sceneexpander.frontend.sfm_types import SfmConfig
 from sceneexpander.generation.protocol import SceneSoFar
 from sceneexpander.geometry.camera import resize_intrinsics, unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rigid_from_parts, rigid_inverse
 from sceneexpander.ingest.fit import FittedPicture
 from sceneexpander.ingest.load import image_tensor
@@ -55,12 +55,13 @@ class Registration:
         """How many points of the scene it shows, or seems to."""
         return len(self.sighting.points)
 
-    def camera(self, found: ResectedView) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "3 3"]]:
-        """(``world_from_cam``, intrinsics in stored pixels)."""
+    def camera(self, found: ResectedView, height: int, width: int) -> Cameras:
+        """One camera, for pictures of the stored size."""
         cam_from_world = rigid_from_parts(torch.from_numpy(found.rotation), torch.from_numpy(found.translation)).float()
         intrinsics = torch.from_numpy(self.sighting.through(found.lens)).float()
         scale = self.stored_per_detail
-        return rigid_inverse(cam_from_world), resize_intrinsics(intrinsics, scale, scale)
+        pose = rigid_inverse(cam_from_world)
+        return Cameras(pose[None], resize_intrinsics(intrinsics, scale, scale)[None], height, width)
 
     def errors_px(self, found: ResectedView) -> Float[np.ndarray, " point"]:
         """Distance of each matched point from where its camera puts it, in stored pixels."""

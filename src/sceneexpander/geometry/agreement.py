@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.geometry.lookup import seen_at
+from sceneexpander.geometry.cameras import Cameras
 
 SAME_SURFACE = 0.04  # log-depth difference that still counts as the same surface
 _HIDDEN = 3 * SAME_SURFACE  # a point further behind what a view sees is hidden from it
@@ -36,17 +36,13 @@ class Agreement:
 def agreement(
     points_world: Float[Tensor, "*point 3"],
     captured_depth: Float[Tensor, "view height width"],
-    captured_world_from_cam: Float[Tensor, "view 4 4"],
-    captured_intrinsics_px: Float[Tensor, "view 3 3"],
+    captured: Cameras,
 ) -> Agreement:
     """Compare points with the captured views' depth maps, all in one frame and scale."""
-    points = points_world.reshape(-1, 3)
-    there, z, in_frame = seen_at(
-        points, captured_depth[:, None], captured_world_from_cam, captured_intrinsics_px, "nearest"
-    )
-    ratio = torch.where(in_frame, (z / there[:, 0].clamp(min=1e-6)).log(), torch.inf)
+    there, found = captured.look_up(points_world.reshape(-1, 3), captured_depth[:, None], "nearest")
+    ratio = torch.where(found.in_frame, (found.depth / there[:, 0].clamp(min=1e-6)).log(), torch.inf)
     # Behind what a view sees, the point is hidden from it: no evidence either way.
-    visible = in_frame & (ratio < _HIDDEN)
+    visible = found.in_frame & (ratio < _HIDDEN)
     distance = torch.where(visible, ratio.abs(), torch.inf)
     nearest, view = distance.min(0)
     seen = nearest.isfinite()
@@ -62,13 +58,12 @@ def colour_difference(
     colours: Float[Tensor, "point 3"],
     captured_images: Float[Tensor, "view 3 height width"],
     captured_depth: Float[Tensor, "view height width"],
-    captured_world_from_cam: Float[Tensor, "view 4 4"],
-    captured_intrinsics_px: Float[Tensor, "view 3 3"],
+    captured: Cameras,
 ) -> Float[Tensor, "point"]:
     """Mean absolute RGB difference of points to the captured view that fits best of those that see them; 0 where none does."""
     content = torch.cat([captured_images, captured_depth[:, None]], dim=1)
-    there, z, in_frame = seen_at(points_world, content, captured_world_from_cam, captured_intrinsics_px, "bilinear")
-    visible = in_frame & ((z / there[:, 3].clamp(min=1e-6)).log() < _HIDDEN)
+    there, found = captured.look_up(points_world, content)
+    visible = found.in_frame & ((found.depth / there[:, 3].clamp(min=1e-6)).log() < _HIDDEN)
     off = (there[:, :3] - colours.T).abs().mean(1)
     best = torch.where(visible, off, torch.inf).amin(0)
     return torch.where(best.isfinite(), best, 0.0)

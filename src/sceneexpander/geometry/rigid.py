@@ -27,6 +27,21 @@ def rigid_from_parts(
     return torch.cat([top, bottom], dim=-2)
 
 
+def rigid_from_twist(twist: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
+    """The rigid motion that a twist (turn in radians about x, y, z, then shift) generates: the exponential of se(3)."""
+    x, y, z, a, b, c = twist.unbind()
+    zero = torch.zeros_like(x)
+    generator = torch.stack(
+        [
+            torch.stack([zero, -z, y, a]),
+            torch.stack([z, zero, -x, b]),
+            torch.stack([-y, x, zero, c]),
+            torch.stack([zero, zero, zero, zero]),
+        ]
+    )
+    return torch.linalg.matrix_exp(generator)
+
+
 def transform_points(
     a_from_b: Float[Tensor, "*batch 4 4"], points_b: Float[Tensor, "*batch point 3"]
 ) -> Float[Tensor, "*batch point 3"]:
@@ -103,7 +118,7 @@ def slerp_wxyz(
 
 
 def look_at(
-    eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*batch 3"], up: Float[Tensor, "*batch 3"]
+    eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """``world_from_cam`` (OpenCV axes) of a camera at ``eye`` that looks at ``target``; ``up`` points up in the world."""
     forward = torch.nn.functional.normalize(target - eye, dim=-1)

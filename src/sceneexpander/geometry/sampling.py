@@ -7,42 +7,38 @@ with a low-pass filter as wide as the samples of the camera that resolves it bes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneexpander.geometry.rigid import rigid_inverse, transform_points
+from sceneexpander.geometry.cameras import Cameras
+from sceneexpander.geometry.rigid import transform_points
 
 BAND_LIMIT_PX = 0.2**0.5  # standard deviation of the filter, pixels of the best camera; Mip-Splatting's constant
 _MARGIN = 0.15  # of the image size beyond its border: a Gaussian there still reaches into the picture
 
 
 @torch.no_grad()
-def finest_pixel(
-    points: Float[Tensor, "point 3"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
-    sizes_px: Sequence[tuple[int, int]],
-) -> Float[Tensor, " point"]:
+def finest_pixel(points: Float[Tensor, "point 3"], cameras: Iterable[Cameras]) -> Float[Tensor, " point"]:
     """Side of the smallest pixel, scene units, with which any camera samples each point; 0 where no camera sees it.
 
     Args:
         points: world frame.
-        world_from_cam: poses.
-        intrinsics_px: at the given sizes.
-        sizes_px: (height, width) of each camera's picture.
+        cameras: groups of one picture size each.
     """
     finest = torch.full_like(points[:, 0], torch.inf)
-    for cam_from_world, k, (height, width) in zip(rigid_inverse(world_from_cam), intrinsics_px, sizes_px, strict=True):
-        x, y, z = transform_points(cam_from_world, points).unbind(-1)
-        depth = z.clamp(min=torch.finfo(z.dtype).tiny)
-        u, v = k[0, 0] * x / depth + k[0, 2], k[1, 1] * y / depth + k[1, 2]
-        inside = (u > -_MARGIN * width) & (u < (1 + _MARGIN) * width)
-        inside &= (v > -_MARGIN * height) & (v < (1 + _MARGIN) * height) & (z > 0)
-        side = depth / torch.maximum(k[0, 0], k[1, 1])
-        finest = torch.where(inside, torch.minimum(finest, side), finest)
+    for group in cameras:
+        height, width = group.height, group.width
+        for cam_from_world, k in zip(group.cam_from_world, group.intrinsics_px, strict=True):
+            x, y, z = transform_points(cam_from_world, points).unbind(-1)
+            depth = z.clamp(min=torch.finfo(z.dtype).tiny)
+            u, v = k[0, 0] * x / depth + k[0, 2], k[1, 1] * y / depth + k[1, 2]
+            inside = (u > -_MARGIN * width) & (u < (1 + _MARGIN) * width)
+            inside &= (v > -_MARGIN * height) & (v < (1 + _MARGIN) * height) & (z > 0)
+            side = depth / torch.maximum(k[0, 0], k[1, 1])
+            finest = torch.where(inside, torch.minimum(finest, side), finest)
     return torch.where(torch.isfinite(finest), finest, torch.zeros_like(finest))
 
 

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.agreement import agreement
-from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gauge import posed_in_both, poses_relative_to
-from sceneexpander.geometry.lookup import project_to_views, sample_at
+from sceneexpander.geometry.lookup import sample_at
 from sceneexpander.geometry.priors import Priors
-from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
+from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.insertion.protocol import RoundInputs
 from sceneexpander.insertion.realign import Realign, anchored_depth, realign
 
@@ -89,16 +89,16 @@ def judge_candidate(
     count = len(images)
     posed = held.posed is None or bool(held.posed[-1])
     both = posed_in_both(captured, joint, count)
-    points = unproject_to_world(depth[-1:], intrinsics[-1:], poses[-1:])[0]
+    cameras = Cameras(poses, intrinsics, *images.shape[2:])
+    points = cameras[-1].unproject(depth[-1:])[0]
     photos = torch.arange(count, device=poses.device)
     if captured.posed is not None and bool(captured.posed.any()):
         photos = photos[captured.posed]
-    found = agreement(points, anchored_depth(captured, anchors)[photos], poses[photos], intrinsics[photos])
+    found = agreement(points, anchored_depth(captured, anchors)[photos], cameras[photos])
     overlap = float(found.seen.float().mean())
     depth_conflict = float(found.conflict[found.seen].abs().median()) if posed and bool(found.seen.any()) else None
-    one = torch.cat([photos, photos.new_tensor([len(poses) - 1])])
     colour_conflict = (
-        _colour_conflict(depth[-1], poses[one], intrinsics[one], images[photos], inserted, found.seen)
+        _colour_conflict(points[found.seen], cameras[photos], images[photos], inserted[:, found.seen])
         if posed
         else None
     )
@@ -148,18 +148,17 @@ def _turned_deg(before: Tensor, after: Tensor) -> float:
 
 
 def _colour_conflict(
-    depth: Tensor, poses: Tensor, intrinsics: Tensor, images: Tensor, inserted: Tensor, seen: Tensor
+    points: Float[Tensor, "point 3"],
+    captured: Cameras,
+    images: Float[Tensor, "view 3 height width"],
+    own: Float[Tensor, "3 point"],
 ) -> float | None:
-    """Median over the seen pixels of the colour difference to the captured view that fits best there."""
-    if not bool(seen.any()):
+    """Median over points of the inserted view of the colour difference to the captured view that fits best there."""
+    if not len(points):
         return None
-    height, width = depth.shape
-    points = unproject_to_world(depth[None], intrinsics[-1:], poses[-1:]).reshape(-1, 3)[seen.flatten()]
-    own = inserted.flatten(1)[:, seen.flatten()]
-    count = len(images)
-    best = torch.full((own.shape[1],), torch.inf, device=own.device)
-    grids, _, in_frame = project_to_views(points, rigid_inverse(poses[:count]), intrinsics[:count], height, width)
-    for picture, grid, inside in zip(images, grids, in_frame, strict=True):
+    best = torch.full_like(own[0], torch.inf)
+    found = captured.project(points)
+    for picture, grid, inside in zip(images, found.grid, found.in_frame, strict=True):
         if not bool(inside.any()):
             continue
         difference = sample_at(picture[None], grid[None])[0] - own

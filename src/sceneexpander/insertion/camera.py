@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from sceneexpander.artifacts.views import ViewSet
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gauge import posed_in_both
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.randomness import child_generator
@@ -75,5 +76,5 @@ def _photo_error(prediction: Prediction, views: ViewSet, compared: Bool[Tensor, 
         raise ValueError("a rendered picture needs the Gaussian head")
     captured = torch.nonzero(compared)[:, 0].tolist()
     poses, intrinsics = prediction.world_from_cam[captured], prediction.intrinsics_px[captured]
-    shown = render(prediction.gaussians, poses, intrinsics, views.height, views.width).rgb.clamp(0, 1)
+    shown = render(prediction.gaussians, Cameras(poses, intrinsics, views.height, views.width)).rgb.clamp(0, 1)
     return float((shown.cpu() - views.images[captured]).square().mean())

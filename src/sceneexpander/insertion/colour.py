@@ -17,8 +17,7 @@ from torch import Tensor
 from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.artifacts.views import to_bytes
 from sceneexpander.geometry.agreement import SAME_SURFACE
-from sceneexpander.geometry.camera import unproject_to_world
-from sceneexpander.geometry.lookup import seen_at
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.insertion.protocol import RoundContext, RoundInputs
 from sceneexpander.reconstruction.loaded import LoadedModel
 from sceneexpander.reconstruction.views import predict
@@ -52,8 +51,7 @@ def tone_inserted_view(inputs: RoundInputs, loaded: LoadedModel) -> RoundInputs:
     tone = match_tone(
         views.images,
         seen.depth.cpu(),
-        seen.world_from_cam.cpu(),
-        seen.intrinsics_px.cpu(),
+        Cameras(seen.world_from_cam.cpu(), seen.intrinsics_px.cpu(), *views.images.shape[2:]),
         generated=views.generated,
         posed=inputs.joint_priors.posed,
         view=len(views) - 1,
@@ -103,8 +101,7 @@ class Tone:
 def match_tone(
     images: Float[Tensor, "view 3 height width"],
     depth: Float[Tensor, "view height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     *,
     generated: Bool[Tensor, "view"],
     posed: Bool[Tensor, "view"] | None = None,
@@ -116,7 +113,7 @@ def match_tone(
 
     Args:
         images: RGB in [0, 1].
-        depth, world_from_cam, intrinsics_px: of all views, in one frame and scale.
+        depth, cameras: of all views, in one frame and scale.
         generated: these views are no photos, and not compared with.
         posed: views whose camera was estimated; what a placeholder shows is not known. Default: all.
         view: whose tone is to change.
@@ -126,15 +123,15 @@ def match_tone(
     """
     height, width = depth.shape[1:]
     placed = torch.ones_like(generated) if posed is None else posed
-    photos, one = torch.nonzero(~generated & placed)[:, 0], slice(view, view + 1)
+    photos = torch.nonzero(~generated & placed)[:, 0]
     if len(photos) == 0 or not bool(placed[view]):
         return None
-    points = unproject_to_world(depth[one], intrinsics_px[one], world_from_cam[one]).reshape(-1, 3)
+    points = cameras[view].unproject(depth[view : view + 1]).reshape(-1, 3)
     content = torch.cat([images[photos], depth[photos, None]], dim=1)
-    there, z, in_frame = seen_at(points, content, world_from_cam[photos], intrinsics_px[photos], "bilinear")
-    ratio = (z / there[:, 3].clamp(min=1e-6)).log()
+    there, found = cameras[photos].look_up(points, content)
+    ratio = (found.depth / there[:, 3].clamp(min=1e-6)).log()
     mine = images[view].flatten(1).expand(len(photos), -1, -1)
-    usable = in_frame & (ratio.abs() < SAME_SURFACE)
+    usable = found.in_frame & (ratio.abs() < SAME_SURFACE)
     for colours in (mine, there[:, :3]):
         usable &= (colours.amin(1) > DARKEST) & (colours.amax(1) < BRIGHTEST)
     if int(usable.any(0).sum()) < LEAST_SHARE * height * width:

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.agreement import agreement, colour_difference
-from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
-from sceneexpander.geometry.lookup import seen_at
 from sceneexpander.insertion.protocol import RoundContext, RoundInputs
 from sceneexpander.splatting import render
 
@@ -38,8 +37,8 @@ class Contradiction:
 def fade_contradicted(reconstruction: Reconstruction, images: Float[Tensor, "view 3 height width"]) -> Reconstruction:
     """The same reconstruction with generated Gaussians as opaque as the captured views let them be, see `opacity_factors`."""
     gaussians, generated = reconstruction.gaussians, reconstruction.generated
-    cameras = reconstruction.world_from_cam, reconstruction.intrinsics_px
-    factors = opacity_factors(gaussians, reconstruction.depth, *cameras, generated, reconstruction.posed, images)
+    posed = reconstruction.posed
+    factors = opacity_factors(gaussians, reconstruction.depth, reconstruction.cameras, generated, posed, images)
     if factors is None:
         return reconstruction
     return replace(reconstruction, gaussians=replace(gaussians, opacities=gaussians.opacities * factors))
@@ -49,8 +48,7 @@ def fade_contradicted(reconstruction: Reconstruction, images: Float[Tensor, "vie
 def opacity_factors(
     gaussians: Gaussians,
     depth: Float[Tensor, "view height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     generated: Bool[Tensor, "view"],
     posed: Bool[Tensor, "view"],
     images: Float[Tensor, "view 3 height width"],
@@ -69,11 +67,9 @@ def opacity_factors(
     made = gaussians.generated & placed
     if not bool(gaussians.generated.any()) or not bool(captured.any()):
         return None
-    cameras = world_from_cam[captured], intrinsics_px[captured]
-    agrees = _agrees(
-        gaussians.means[made], rgb_from_sh(gaussians.sh[made, 0]), images[captured], depth[captured], *cameras
-    )
-    filled = filled_by_captured(gaussians, world_from_cam, intrinsics_px, generated, *depth.shape[1:])
+    colours = rgb_from_sh(gaussians.sh[made, 0])
+    agrees = _agrees(gaussians.means[made], colours, images[captured], depth[captured], cameras[captured])
+    filled = filled_by_captured(gaussians, cameras, generated)
     factors = torch.where(gaussians.generated & ~placed, LOST, torch.ones_like(gaussians.opacities))
     factors[made] = 1 - filled[made] * (1 - agrees)
     return factors
@@ -88,16 +84,15 @@ def pixel_trust(
     Elsewhere in generated views it falls with the difference to the captured view that agrees best, in place and in colour.
     """
     depth, generated = reconstruction.depth, reconstruction.generated
-    poses, intrinsics = reconstruction.world_from_cam, reconstruction.intrinsics_px
+    cameras = reconstruction.cameras
     trust, captured = torch.ones_like(depth), ~generated & reconstruction.posed
     if not bool(captured.any()):
         return trust
-    cameras = poses[captured], intrinsics[captured]
     for view in torch.nonzero(generated)[:, 0].tolist():
-        one = slice(view, view + 1)
-        points = unproject_to_world(depth[one], intrinsics[one], poses[one]).reshape(-1, 3)
+        points = cameras[view].unproject(depth[view : view + 1]).reshape(-1, 3)
         colours = images[view].flatten(1).T
-        trust[view] = _agrees(points, colours, images[captured], depth[captured], *cameras).view_as(depth[view])
+        agrees = _agrees(points, colours, images[captured], depth[captured], cameras[captured])
+        trust[view] = agrees.view_as(depth[view])
     return trust
 
 
@@ -106,27 +101,24 @@ def _agrees(
     colours: Float[Tensor, "point 3"],
     captured_images: Float[Tensor, "view 3 height width"],
     captured_depth: Float[Tensor, "view height width"],
-    captured_world_from_cam: Float[Tensor, "view 4 4"],
-    captured_intrinsics_px: Float[Tensor, "view 3 3"],
+    captured: Cameras,
 ) -> Float[Tensor, "point"]:
     """1 where nothing contradicts a coloured point, falling to 0 as captured views see another place or colour there."""
-    cameras = captured_world_from_cam, captured_intrinsics_px
-    found = agreement(points_world, captured_depth, *cameras)
-    off = colour_difference(points_world, colours, captured_images, captured_depth, *cameras)
+    found = agreement(points_world, captured_depth, captured)
+    off = colour_difference(points_world, colours, captured_images, captured_depth, captured)
     return found.weight * torch.where(found.seen, torch.exp(-((off / SAME_COLOUR) ** 2) / 2), 1.0)
 
 
 @torch.no_grad()
 def filled_by_captured(
-    gaussians: Gaussians, world_from_cam: Tensor, intrinsics_px: Tensor, generated: Tensor, height: int, width: int
+    gaussians: Gaussians, cameras: Cameras, generated: Bool[Tensor, "view"]
 ) -> Float[Tensor, "gaussian"]:
     """For every Gaussian of a generated view: how far captured Gaussians alone fill its pixel, seen from that view. 0 for the others."""
     taken = gaussians.select(~gaussians.generated)
     filled = torch.zeros_like(gaussians.opacities)
     for view in torch.nonzero(generated)[:, 0].tolist():
-        camera = world_from_cam[view][None], intrinsics_px[view][None]
-        alpha = render(taken, *camera, height, width).alpha
+        alpha = render(taken, cameras[view]).alpha
         own = gaussians.source_view == view
-        there, _, in_frame = seen_at(gaussians.means[own], alpha[:, None], *camera, "bilinear")
-        filled[own] = torch.where(in_frame[0], there[0, 0], 0.0).clamp(0, 1)
+        there, found = cameras[view].look_up(gaussians.means[own], alpha[:, None])
+        filled[own] = torch.where(found.in_frame[0], there[0, 0], 0.0).clamp(0, 1)
     return filled

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
-from sceneexpander.geometry.lookup import project_to_views
-from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rigid_inverse, rotation_from_quat_wxyz
+from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from sceneexpander.insertion.contradiction import filled_by_captured
 from sceneexpander.insertion.protocol import RoundContext, RoundInputs
 from sceneexpander.ranges import Range, check_ranges
@@ -56,15 +56,14 @@ def close_gaps(reconstruction: Reconstruction, reach: float) -> Reconstruction:
     if reach <= 0 or not generated:
         return reconstruction
     gaussians = reconstruction.gaussians
-    poses, intrinsics = reconstruction.world_from_cam, reconstruction.intrinsics_px
-    height, width = reconstruction.depth.shape[1:]
-    filled = filled_by_captured(gaussians, poses, intrinsics, reconstruction.generated, height, width)
+    cameras = reconstruction.cameras
+    filled = filled_by_captured(gaussians, cameras, reconstruction.generated)
     scales, quats = gaussians.scales.clone(), gaussians.quat_wxyz.clone()
     for view in generated:
         own = torch.nonzero(gaussians.source_view == view)[:, 0]
         part = gaussians.select(own)
-        grid, depth = _grid(part, poses[view], intrinsics[view], height, width)
-        focal = float((intrinsics[view, 0, 0] * intrinsics[view, 1, 1]).sqrt())
+        grid, depth = _grid(part, cameras[view])
+        focal = float((cameras.intrinsics_px[view, 0, 0] * cameras.intrinsics_px[view, 1, 1]).sqrt())
         covariance = _covariance(part)
         missing = torch.zeros_like(covariance)
         for dim in (0, 1):
@@ -80,20 +79,17 @@ def close_gaps(reconstruction: Reconstruction, reach: float) -> Reconstruction:
     return replace(reconstruction, gaussians=replace(gaussians, scales=scales, quat_wxyz=quats))
 
 
-def _grid(
-    gaussians: Gaussians, world_from_cam: Tensor, intrinsics_px: Tensor, height: int, width: int
-) -> tuple[Int[Tensor, "height width"], Float[Tensor, "gaussian"]]:
+def _grid(gaussians: Gaussians, camera: Cameras) -> tuple[Int[Tensor, "height width"], Float[Tensor, "gaussian"]]:
     """(which Gaussian of one view lies in which of its pixels, the last one of several and -1 without one; their z-depths)."""
-    place, depth, in_frame = project_to_views(
-        gaussians.means, rigid_inverse(world_from_cam)[None], intrinsics_px[None], height, width
-    )
-    size = place.new_tensor([width, height])
-    column, row = ((place[0] + 1) / 2 * size).floor().long().unbind(-1)
-    index = torch.arange(len(gaussians), device=place.device)
-    grid = torch.full((height * width,), _NONE, dtype=torch.long, device=place.device)
-    inside = in_frame[0]
+    found = camera.project(gaussians.means)
+    height, width = camera.height, camera.width
+    size = found.grid.new_tensor([width, height])
+    column, row = ((found.grid[0] + 1) / 2 * size).floor().long().unbind(-1)
+    index = torch.arange(len(gaussians), device=size.device)
+    grid = torch.full((height * width,), _NONE, dtype=torch.long, device=size.device)
+    inside = found.in_frame[0]
     grid.scatter_reduce_(0, (row * width + column)[inside], index[inside], "amax")
-    return grid.view(height, width), depth[0]
+    return grid.view(height, width), found.depth[0]
 
 
 def _to_neighbours(

@@ -31,8 +31,8 @@ class GaussianHead(HeadConfig):
             if prediction.gaussians is None or prediction.depth is None:
                 return None
             posed = generated.new_ones(len(generated)) if priors is None or priors.posed is None else priors.posed
-            cameras = prediction.world_from_cam, prediction.intrinsics_px
-            return opacity_factors(prediction.gaussians, prediction.depth, *cameras, generated, posed, images)
+            cameras = prediction.cameras_of(*images.shape[2:])
+            return opacity_factors(prediction.gaussians, prediction.depth, cameras, generated, posed, images)
 
         loaded.apply(weights)
         fade_as_shown = fade if context.doubted else None

@@ -16,11 +16,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.artifacts.anchors import Anchors
-from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gauge import posed_in_both
-from sceneexpander.geometry.lookup import grid_of_pixels, sample_at
 from sceneexpander.geometry.priors import Priors
-from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg, transform_points
+from sceneexpander.geometry.rigid import rigid_from_twist, rotation_angle_deg
 from sceneexpander.geometry.similarity import align_views
 
 _POINTS = 6000
@@ -139,32 +138,35 @@ def _refined(
     """Direct image alignment of the inserted camera with the captured points, then the scale of its depth."""
     poses, intrinsics, depth = _parts(held)
     count = len(images)
+    cameras = Cameras(poses, intrinsics, *images.shape[2:])
     seen = torch.arange(count, device=poses.device)
     if held.posed is not None and bool(held.posed[:count].any()):
         seen = seen[held.posed[:count]]  # where the points of a placeholder are means nothing
     own = anchored_depth(held, anchors)
-    points = unproject_to_world(own[seen], intrinsics[seen], poses[seen]).reshape(-1, 3)
+    points = cameras[seen].unproject(own[seen]).reshape(-1, 3)
     colours = images[seen].movedim(1, -1).reshape(-1, 3)
     chosen = torch.randperm(len(points), generator=generator)[: 4 * _POINTS].to(points.device)
     points, colours = points[chosen], colours[chosen]
-    visible = _in_frame(points, poses[-1], intrinsics[-1], depth[-1])
+    given = cameras[-1]
+    there, found = given.look_up(points, depth[-1:, None])
+    visible = found.in_frame[0] & (found.depth[0] < there[0, 0] * _OCCLUDED)  # not clearly behind its own depth
     points, colours = points[visible][:_POINTS], colours[visible][:_POINTS]
     if len(points) < _FEWEST:
         return held, None
-    cam_from_world = rigid_inverse(poses[-1])
-    before = _cost(points, colours, cam_from_world, intrinsics[-1], inserted)
+    camera = given
+    before = _cost(points, colours, camera, inserted)
     for blur in _BLURS_PX:
         blurred = _blur_picture(inserted, blur)
         for _ in range(_STEPS):
-            cam_from_world = _gauss_newton(points, colours, cam_from_world, intrinsics[-1], blurred)
-    after = _cost(points, colours, cam_from_world, intrinsics[-1], inserted)
-    pose = rigid_inverse(cam_from_world)
-    accepted = bool(torch.isfinite(pose).all()) and after < before
-    factor = _depth_factor(points, cam_from_world, intrinsics[-1], depth[-1]) if accepted else 1.0
+            camera = _gauss_newton(points, colours, camera, blurred)
+    after = _cost(points, colours, camera, inserted)
+    accepted = bool(torch.isfinite(camera.world_from_cam).all()) and after < before
+    factor = _depth_factor(points, camera, depth[-1]) if accepted else 1.0
     median = float(own.median())
+    turn = rotation_angle_deg(camera.world_from_cam[0, :3, :3], poses[-1, :3, :3])
     report = RealignReport(
-        turned_deg=float(rotation_angle_deg(pose[:3, :3], poses[-1, :3, :3])) if accepted else 0.0,
-        shifted=float((pose[:3, 3] - poses[-1, :3, 3]).norm()) / median if accepted else 0.0,
+        turned_deg=float(turn) if accepted else 0.0,
+        shifted=float((camera.centres - given.centres).norm()) / median if accepted else 0.0,
         scale=factor,
         error_before=before,
         error_after=after,
@@ -175,53 +177,34 @@ def _refined(
         return held, report
     moved = replace(
         held,
-        world_from_cam=torch.cat([poses[:-1], pose[None]]),
+        world_from_cam=torch.cat([poses[:-1], camera.world_from_cam]),
         depth=torch.cat([depth[:-1], depth[-1:] * factor]),
     )
     return moved, report
 
 
-def _project(points: Tensor, cam_from_world: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """(pixels, depth) of world points in a camera."""
-    local = transform_points(cam_from_world, points)
-    depth = local[:, 2]
-    return (local @ intrinsics.T)[:, :2] / depth.clamp(min=1e-6)[:, None], depth
-
-
-def _look_up(plane: Tensor, pixel: Tensor) -> Tensor:
-    """(channel, point): bilinear samples of a (channel, height, width) map; the border is repeated."""
-    height, width = plane.shape[-2:]
-    return sample_at(plane[None], grid_of_pixels(pixel, height, width).clamp(-2, 2)[None])[0]
-
-
-def _in_frame(points: Tensor, world_from_cam: Tensor, intrinsics: Tensor, depth: Tensor) -> Tensor:
-    """Which points the camera has in frame, not clearly behind its own depth."""
-    height, width = depth.shape
-    pixel, z = _project(points, rigid_inverse(world_from_cam), intrinsics)
-    inside = (z > 1e-6) & (pixel > 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
-    own = _look_up(depth[None], pixel)[0]
-    return inside & (z < own * _OCCLUDED)
-
-
-def _residual(points: Tensor, colours: Tensor, cam_from_world: Tensor, intrinsics: Tensor, picture: Tensor) -> Tensor:
-    """(point, 3) colour differences, each colour's mean taken out: exposure and colour cast are no misalignment."""
-    pixel, _ = _project(points, cam_from_world, intrinsics)
-    difference = _look_up(picture, pixel).T - colours
+def _residual(
+    points: Float[Tensor, "point 3"],
+    colours: Float[Tensor, "point 3"],
+    camera: Cameras,
+    picture: Float[Tensor, "3 height width"],
+) -> Float[Tensor, "point 3"]:
+    """Colour differences, each colour's mean taken out: exposure and colour cast are no misalignment."""
+    there, _ = camera.look_up(points, picture[None])
+    difference = there[0].T - colours
     return difference - difference.mean(0, keepdim=True)
 
 
-def _cost(points: Tensor, colours: Tensor, cam_from_world: Tensor, intrinsics: Tensor, picture: Tensor) -> float:
-    squared = _residual(points, colours, cam_from_world, intrinsics, picture).square().sum(-1) / _COLOUR_SCALE**2
+def _cost(points: Tensor, colours: Tensor, camera: Cameras, picture: Tensor) -> float:
+    squared = _residual(points, colours, camera, picture).square().sum(-1) / _COLOUR_SCALE**2
     return float(torch.log1p(squared).mean())
 
 
-def _gauss_newton(
-    points: Tensor, colours: Tensor, cam_from_world: Tensor, intrinsics: Tensor, picture: Tensor
-) -> Tensor:
+def _gauss_newton(points: Tensor, colours: Tensor, camera: Cameras, picture: Tensor) -> Cameras:
     """One damped step on the six parameters of the camera (a small turn and shift in its own frame)."""
 
     def residual(twist: Tensor) -> Tensor:
-        return _residual(points, colours, _moved(cam_from_world, twist), intrinsics, picture).flatten()
+        return _residual(points, colours, _moved(camera, twist), picture).flatten()
 
     # Central differences: twelve cheap look-ups, and bilinear samples have no forward derivative in torch.
     steps = _DIFFERENCE * torch.eye(6, dtype=points.dtype, device=points.device)
@@ -231,22 +214,12 @@ def _gauss_newton(
     normal = jacobian.T @ (weight[:, None] * jacobian)
     damped = normal + 1e-3 * torch.diag(normal.diagonal().clamp(min=1e-8))
     twist = torch.linalg.solve(damped, -(jacobian.T @ (weight * error)))
-    return _moved(cam_from_world, twist.clamp(-0.05, 0.05))
+    return _moved(camera, twist.clamp(-0.05, 0.05))
 
 
-def _moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:
-    """The pose followed by a small rigid motion: the exponential of the twist (turn, shift)."""
-    x, y, z, a, b, c = twist.unbind()
-    zero = torch.zeros_like(x)
-    generator = torch.stack(
-        [
-            torch.stack([zero, -z, y, a]),
-            torch.stack([z, zero, -x, b]),
-            torch.stack([-y, x, zero, c]),
-            torch.stack([zero, zero, zero, zero]),
-        ]
-    )
-    return torch.linalg.matrix_exp(generator) @ cam_from_world
+def _moved(camera: Cameras, twist: Float[Tensor, "6"]) -> Cameras:
+    """The camera after a small rigid motion of the scene in its frame."""
+    return replace(camera, world_from_cam=camera.world_from_cam @ rigid_from_twist(-twist))
 
 
 def _blur_picture(picture: Tensor, sigma: float) -> Tensor:
@@ -257,11 +230,10 @@ def _blur_picture(picture: Tensor, sigma: float) -> Tensor:
     return gaussian_blur2d(picture[None], (size, size), (sigma, sigma), border_type="replicate")[0]
 
 
-def _depth_factor(points: Tensor, cam_from_world: Tensor, intrinsics: Tensor, depth: Tensor) -> float:
+def _depth_factor(points: Float[Tensor, "point 3"], camera: Cameras, depth: Float[Tensor, "height width"]) -> float:
     """Median ratio of the captured points' depth in the inserted camera to its own depth there."""
-    pixel, z = _project(points, cam_from_world, intrinsics)
-    height, width = depth.shape
-    inside = (z > 1e-6) & (pixel > 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+    there, found = camera.look_up(points, depth[None, None])
+    inside = found.in_frame[0]
     if int(inside.sum()) < _FEWEST:
         return 1.0
-    return float((z / _look_up(depth[None], pixel)[0])[inside].median())
+    return float((found.depth[0] / there[0, 0])[inside].median())

@@ -38,8 +38,7 @@ def with_depth(
             images=images,
             depth=depth,
             depth_conf=conf,
-            world_from_cam=prediction.world_from_cam,
-            intrinsics_px=prediction.intrinsics_px,
+            cameras=prediction.cameras_of(*images.shape[2:]),
             normals=normals,
             generated=generated,
         )

@@ -27,6 +27,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.normals import normals_from_depth, viewing_rays
 from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rigid_inverse, transform_points
@@ -55,8 +56,7 @@ def pixel_aligned(
     images: Float[Tensor, "view 3 height width"],
     depth: Float[Tensor, "view height width"],
     depth_conf: Float[Tensor, "view height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     normals: Float[Tensor, "view height width 3"] | None = None,
     generated: Bool[Tensor, "view"] | None = None,
     scale_factors: Float[Tensor, "view height width 3"] | None = None,
@@ -70,8 +70,7 @@ def pixel_aligned(
         images: RGB in [0, 1].
         depth: z-depth, > 0.
         depth_conf: confidence of the depth, > 1.
-        world_from_cam: poses.
-        intrinsics_px: pinhole intrinsics at the images' size.
+        cameras: at the images' size.
         normals: camera frame, unit, facing the camera; default: those of the depth map.
         generated: which views are generated (default: none).
         scale_factors: on the scales of the rule, before the band limit (default: 1).
@@ -84,7 +83,7 @@ def pixel_aligned(
     for name, value in (("depth", depth), ("depth_conf", depth_conf)):
         if tuple(value.shape) != (views, height, width):
             raise ValueError(f"{name} has shape {tuple(value.shape)}, the images need {(views, height, width)}")
-    poses, intrinsics = world_from_cam.detach(), intrinsics_px.detach()
+    poses, intrinsics = cameras.world_from_cam.detach(), cameras.intrinsics_px.detach()
     with torch.no_grad():
         if normals is None:
             normals = normals_from_depth(depth, intrinsics)

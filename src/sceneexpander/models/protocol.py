@@ -10,6 +10,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import GaussianCounts, Gaussians
 from sceneexpander.geometry.priors import Priors
 
@@ -47,6 +48,10 @@ class Prediction:
     gaussian_depth: Float[Tensor, "view height width"] | None = None  # depth that placed the Gaussians
     gaussians: Gaussians | None = None  # after the model's own merge
     gaussian_counts: GaussianCounts | None = None  # None: one Gaussian per pixel, all kept
+
+    def cameras_of(self, height: int, width: int) -> Cameras:
+        """The cameras, for pictures of this size (that of the views)."""
+        return Cameras(self.world_from_cam, self.intrinsics_px, height, width)
 
 
 @runtime_checkable

@@ -8,7 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
-from sceneexpander.artifacts.store import directory_being_written, load_fields, load_resume_point, save_artifact
+from sceneexpander.artifacts.store import load_fields, load_resume_point, save_artifact
+from sceneexpander.files import directory_being_written
 
 SCHEMA = "optimisation-checkpoint/1"
 

@@ -17,6 +17,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import sha256_of_tensors, to_plain
 from sceneexpander.evaluation.image import WINDOW, similarity
 from sceneexpander.geometry.camera import camera_vector_from_pose
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.optimisation.cameras import RefinedCameras
@@ -240,7 +241,7 @@ class _Run:
         for view in self._views:
             one = slice(view, view + 1)
             lens = start.intrinsics_px[one].to(self._device)
-            seen = render(gaussians.to(self._device), poses[one].to(self._device), lens, height, width)
+            seen = render(gaussians.to(self._device), Cameras(poses[one].to(self._device), lens, height, width))
             shown = (seen.alpha > _COVERED) & (seen.depth > 0)
             depth[one] = torch.where(shown.cpu(), seen.depth.cpu(), depth[one])
         return replace(

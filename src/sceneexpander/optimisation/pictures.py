@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from sceneexpander.evaluation.image import WINDOW
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.sampling import finest_pixel
 from sceneexpander.splatting import RasterSettings
@@ -89,13 +90,8 @@ class Pictures:
         self, points: Float[Tensor, "point 3"], world_from_cam: Float[Tensor, "view 4 4"], views: list[int]
     ) -> Float[Tensor, " point"]:
         """See `sceneexpander.geometry.sampling.finest_pixel`, for the given views at the sizes of their photos."""
-        stored_height, stored_width = (int(side) for side in self._images.shape[2:])
-        sizes = [self._own_size(view) for view in views]
-        lenses = [
-            resize_intrinsics(self._intrinsics[view], width / stored_width, height / stored_height)
-            for view, (height, width) in zip(views, sizes, strict=True)
-        ]
-        return finest_pixel(points, world_from_cam[views], torch.stack(lenses), sizes)
+        stored = self._cameras(world_from_cam)
+        return finest_pixel(points, [stored[view].resized(*self._own_size(view)) for view in views])
 
     def compensated(self, gaussians: Gaussians, world_from_cam: Float[Tensor, "view 4 4"]) -> Gaussians:
         """Gaussians as rasterisers that compensate for the screen blur draw them: of others, what the blur makes at the stored size.
@@ -104,11 +100,13 @@ class Pictures:
         """
         if gaussians.antialiased:
             return gaussians
-        height, width = (int(side) for side in self._images.shape[2:])
-        sizes = [(height, width)] * len(world_from_cam)
-        pixel = finest_pixel(gaussians.means, world_from_cam, self._intrinsics, sizes)
+        pixel = finest_pixel(gaussians.means, [self._cameras(world_from_cam)])
         blur = RasterSettings().eps2d * pixel.square()
         return replace(gaussians, scales=(gaussians.scales.square() + blur[:, None]).sqrt(), antialiased=True)
+
+    def _cameras(self, world_from_cam: Float[Tensor, "view 4 4"]) -> Cameras:
+        height, width = (int(side) for side in self._images.shape[2:])
+        return Cameras(world_from_cam, self._intrinsics, height, width)
 
     def _own_size(self, view: int) -> tuple[int, int]:
         height, width = (int(side) for side in self._images.shape[2:])

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.models.protocol import Prediction
 from sceneexpander.splatting import render
 
@@ -37,11 +38,11 @@ def photometric_error(
     height, width = images.shape[-2:]
     counted = torch.ones(height, width, dtype=torch.bool, device=images.device) if mask is None else mask
     pose, intrinsics = prediction.world_from_cam[view : view + 1], prediction.intrinsics_px[view : view + 1]
-    whole = render(gaussians, pose, intrinsics, height, width)
+    whole = render(gaussians, Cameras(pose, intrinsics, height, width))
     distance = torch.square if squared else torch.abs
     total = _masked_mean(distance(whole.rgb[0] - images[view]).mean(0), counted)
     if others_weight > 0 and images.shape[0] > 1:
-        others = render(gaussians.select(gaussians.source_view != view), pose, intrinsics, height, width)
+        others = render(gaussians.select(gaussians.source_view != view), Cameras(pose, intrinsics, height, width))
         covered = (others.alpha[0].detach() > min_alpha) & counted
         # Colour of what is there, not of the black behind it: the loss is to move geometry, not to fill holes.
         colour = others.rgb[0] / others.alpha[0].clamp(min=min_alpha)

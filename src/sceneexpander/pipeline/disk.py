@@ -7,7 +7,7 @@ import stat
 from pathlib import Path
 
 from sceneexpander.errors import UserError
-from sceneexpander.project import find_project
+from sceneexpander.pipeline.project import find_project
 
 _LITTLE_BYTES = 1 << 20  # a disk with less than that is full
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.store import write_bytes_atomic
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.unasked import answer_unasked
 
 

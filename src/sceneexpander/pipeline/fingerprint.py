@@ -63,9 +63,13 @@ class SourceTree:
 
     def fingerprint(self, module: str) -> str:
         """Hex digest of the closure's syntax trees and of the data files beside them."""
+        return self.fingerprint_of(self.closure(module))
+
+    def fingerprint_of(self, modules: Sequence[str]) -> str:
+        """The same of a closure that is known."""
         digest = hashlib.sha256()
         folders: set[Path] = set()
-        for name in self.closure(module):
+        for name in modules:
             path = self.file_of(name)
             assert path is not None  # noqa: S101 - closure holds only modules with a file
             digest.update(f"{name}\n{meaning(path)}\n".encode())
@@ -85,46 +89,66 @@ class SourceTree:
 
     def _imports(self, module: str, path: Path) -> Iterator[str]:
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-        tree = _parsed(path.read_text(encoding="utf-8"), str(path))
-        declared = _declared_imports(tree)
-        yield from declared or ()
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Import):
-                yield from (alias.name for alias in node.names)
-            elif isinstance(node, ast.ImportFrom):
-                base = _absolute(node, package)
-                for alias in node.names:
+        source = _source_of(path)
+        yield from source.declared or ()
+        for statement in source.imports:
+            if isinstance(statement, ast.Import):
+                yield from (alias.name for alias in statement.names)
+            else:
+                base = _absolute(statement, package)
+                for alias in statement.names:
                     # ``from a import b``: b is a submodule or a name inside a.
                     submodule = f"{base}.{alias.name}"
                     yield submodule if self.file_of(submodule) or self.is_package(submodule) else base
-            elif isinstance(node, ast.Call) and _is_import_module(node.func):
-                target = node.args[0] if node.args else None
-                if isinstance(target, ast.Constant) and isinstance(target.value, str):
-                    yield target.value
-                elif declared is None:
-                    raise FingerprintError(
-                        f"{path}:{node.lineno}: imports by a computed name; list the modules in DYNAMIC_IMPORTS"
-                    )
+        for line, name in source.calls:
+            if name is not None:
+                yield name
+            elif source.declared is None:
+                raise FingerprintError(
+                    f"{path}:{line}: imports by a computed name; list the modules in DYNAMIC_IMPORTS"
+                )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Source:
+    """What one file says: how it imports, and the rest as a hash."""
+
+    declared: Sequence[str] | None  # its DYNAMIC_IMPORTS
+    imports: Sequence[ast.Import | ast.ImportFrom]
+    calls: Sequence[tuple[int, str | None]]  # of ``import_module``: the line, the name if it is written there
+    meaning: str
 
 
 def meaning(path: Path) -> str:
-    """The syntax tree of a Python file as text, without docstrings, comments and positions."""
-    return _meaning(path.read_text(encoding="utf-8"), str(path))
+    """Hash of the syntax tree of a Python file without docstrings, comments and positions."""
+    return _source_of(path).meaning
+
+
+def _source_of(path: Path) -> _Source:
+    return _read(path.read_text(encoding="utf-8"), str(path))
 
 
 # Stages share most of their modules.
-@functools.lru_cache(maxsize=1024)
-def _parsed(text: str, name: str) -> ast.Module:
-    return ast.parse(text, filename=name)
-
-
-@functools.lru_cache(maxsize=1024)
-def _meaning(text: str, name: str) -> str:
+@functools.lru_cache(maxsize=2048)
+def _read(text: str, name: str) -> _Source:
     tree = ast.parse(text, filename=name)
+    imports: list[ast.Import | ast.ImportFrom] = []
+    calls: list[tuple[int, str | None]] = []
     for node in ast.walk(tree):
-        if isinstance(node, _DOCUMENTED) and node.body and _is_docstring(node.body[0]):
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            imports.append(node)
+        elif isinstance(node, ast.Call) and _is_import_module(node.func):
+            target = node.args[0] if node.args else None
+            written = target.value if isinstance(target, ast.Constant) else None
+            calls.append((node.lineno, written if isinstance(written, str) else None))
+        elif isinstance(node, _DOCUMENTED) and node.body and _is_docstring(node.body[0]):
             node.body = node.body[1:] or [ast.Pass()]
-    return ast.dump(tree)
+    return _Source(
+        declared=_declared_imports(tree),
+        imports=imports,
+        calls=calls,
+        meaning=hashlib.sha256(ast.dump(tree).encode()).hexdigest(),
+    )
 
 
 def _is_docstring(statement: ast.stmt) -> bool:

@@ -36,11 +36,11 @@ from sceneexpander.pipeline.declared import (
 )
 from sceneexpander.pipeline.disk import remove_tree, require_room
 from sceneexpander.pipeline.locks import run_lock
+from sceneexpander.pipeline.processes import ended_by_signals, kept
+from sceneexpander.pipeline.project import find_project
 from sceneexpander.pipeline.recording import ask_for_recording
 from sceneexpander.pipeline.surroundings import pipeline_environment
 from sceneexpander.pipeline.unasked import answer_unasked
-from sceneexpander.processes import ended_by_signals, kept
-from sceneexpander.project import find_project
 
 STATE = Path(".cache") / "run" / "state.json"
 _SCHEMA = "run/1"

@@ -19,7 +19,7 @@ from sceneexpander.ingest import load_scene
 from sceneexpander.ingest.truth import check_truth
 from sceneexpander.judge import make_judge
 from sceneexpander.models.weights import HUB_ID
-from sceneexpander.project import GENERATED_FOLDER, JUDGED_FOLDER, find_project
+from sceneexpander.pipeline.project import GENERATED_FOLDER, JUDGED_FOLDER, find_project
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.server import require_server, where_runs_go

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sceneexpander.artifacts.store import read_json, read_typed
 from sceneexpander.errors import UserError
-from sceneexpander.project import ROOT_ENV
+from sceneexpander.pipeline.project import ROOT_ENV
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.server import shown, where_runs_go
 from sceneexpander.tracking.store import database_path

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from configobj import ConfigObj, ConfigObjError
 
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.errors import UserError
-from sceneexpander.project import ERROR_FILE_ENV, ROOT_ENV
+from sceneexpander.files import write_bytes_atomic
+from sceneexpander.pipeline.project import ERROR_FILE_ENV, ROOT_ENV
 from sceneexpander.tracking.server import SHELL_URI
 from sceneexpander.tracking.store import without_foreign_settings
 

@@ -12,10 +12,11 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from sceneexpander.artifacts.store import directory_being_written, write_json_atomic
+from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import UserError
+from sceneexpander.files import directory_being_written
 
 METHODS_FILE = "methods.yaml"  # of a scene: for every method that is not always made, whether it is wanted
 NOT_ASKED = "was not asked for"

@@ -16,16 +16,16 @@ import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.config.overrides import key_of, written_out
 from sceneexpander.errors import UserError, interruptible
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.disk import make_writable, remove_tree, require_room
 from sceneexpander.pipeline.locks import RunLock, file_lock
 from sceneexpander.pipeline.packages import LOCKS
+from sceneexpander.pipeline.processes import ended_by_signals, kept
+from sceneexpander.pipeline.project import SWEEP_ENV, find_project
+from sceneexpander.pipeline.selection import PARAMS, Selection
 from sceneexpander.pipeline.surroundings import LOCAL_CONFIG, local_config, pipeline_environment
-from sceneexpander.processes import ended_by_signals, kept
-from sceneexpander.project import SWEEP_ENV, find_project
-from sceneexpander.selection import PARAMS, Selection
 
 COPIED_FOLDERS = ("conf", "src", "stages")
 COPIED_FILES = ("dvc.yaml", ".dvcignore", "pyproject.toml", *LOCKS, ".dvc/config")

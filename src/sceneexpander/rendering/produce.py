@@ -16,6 +16,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.artifacts.views import save_png
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.rendering.config import RenderConfig
 from sceneexpander.rendering.tour import Tour, plan_tour
 from sceneexpander.splatting import RasterSettings, Render, render
@@ -55,8 +56,8 @@ def produce_renders(
         method=reconstruction.method,
         frames=config.frames,
         fps=config.fps,
-        height=tour.height,
-        width=tour.width,
+        height=tour.cameras.height,
+        width=tour.cameras.width,
         videos={name: f"{name}.mp4" for name in LAYERS},
         stills=stills,
         views=views,
@@ -64,8 +65,8 @@ def produce_renders(
         inserted_camera=tour.inserted_camera,
         gaussians=len(reconstruction.gaussians),
         scene="gaussians.ply",
-        world_from_cam=tour.world_from_cam,
-        intrinsics_px=tour.intrinsics_px,
+        world_from_cam=tour.cameras.world_from_cam,
+        intrinsics_px=tour.cameras.intrinsics_px,
     )
     renders.save(folder)
     return renders
@@ -97,25 +98,17 @@ class _Eye:
         self._settings = RasterSettings(threads=threads)
         self._device = device
 
-    def __call__(self, pose: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], height: int, width: int) -> Render:
-        return render(
-            self._gaussians,
-            pose[None].to(self._device),
-            intrinsics[None].to(self._device),
-            height,
-            width,
-            background=self._background,
-            settings=self._settings,
-        )
+    def __call__(self, camera: Cameras) -> Render:
+        return render(self._gaussians, camera.to(self._device), background=self._background, settings=self._settings)
 
 
 def _see_again(reconstruction: Reconstruction, see: _Eye, folder: Path) -> tuple[tuple[str, str], ...]:
     """Every view rendered at its own camera: (view, picture)."""
     (folder / "views").mkdir()
-    height, width = reconstruction.depth.shape[1:]
+    cameras = reconstruction.cameras
     views = []
     for index, view in enumerate(reconstruction.view_ids):
-        seen = see(reconstruction.world_from_cam[index], reconstruction.intrinsics_px[index], height, width)
+        seen = see(cameras[index])
         views.append((view, f"views/{view}.png"))
         save_png(folder / "views" / f"{view}.png", seen.rgb[0])
     return tuple(views)
@@ -126,7 +119,7 @@ def _film(
 ) -> tuple[tuple[int, dict[str, str]], ...]:
     """Render and encode frame by frame; only the depths are kept, because their colours need the range of the whole video."""
     (folder / "stills").mkdir()
-    kept = _stills(len(tour.world_from_cam), tour.inserted_frame, config.stills)
+    kept = _stills(len(tour.cameras), tour.inserted_frame, config.stills)
     names = {index: {layer: f"stills/{layer}_{index:04d}.png" for layer in LAYERS} for index in kept}
     depths: list[Float[Tensor, "height width"]] = []
     with contextlib.ExitStack() as videos:
@@ -140,8 +133,8 @@ def _film(
             if index in names:
                 save_png(folder / names[index][layer], picture)
 
-        for index, (pose, intrinsics) in enumerate(zip(tour.world_from_cam, tour.intrinsics_px, strict=True)):
-            seen = see(pose, intrinsics, tour.height, tour.width)
+        for index in range(len(tour.cameras)):
+            seen = see(tour.cameras[index])
             rgb, alpha = seen.rgb[0].clamp(0, 1).cpu(), seen.alpha[0].cpu()
             show("rgb", index, rgb)
             show("provenance", index, tint_generated(rgb, seen.generated[0].cpu() * alpha))
@@ -165,12 +158,12 @@ def _save_trajectory(tour: Tour, config: RenderConfig, path: Path) -> None:
         "convention": "OpenCV axes, world_from_cam, intrinsics in pixels with the origin at the corner of the first pixel",
         "path": config.path,
         "fps": config.fps,
-        "height": tour.height,
-        "width": tour.width,
+        "height": tour.cameras.height,
+        "width": tour.cameras.width,
         "inserted_frame": tour.inserted_frame,
         "frames": [
             {"world_from_cam": pose.tolist(), "intrinsics_px": intrinsics.tolist()}
-            for pose, intrinsics in zip(tour.world_from_cam, tour.intrinsics_px, strict=True)
+            for pose, intrinsics in zip(tour.cameras.world_from_cam, tour.cameras.intrinsics_px, strict=True)
         ],
     }
     write_json_atomic(path, content)

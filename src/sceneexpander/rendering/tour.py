@@ -12,7 +12,7 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.views import same_place
-from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import look_at
 from sceneexpander.geometry.trajectory import focus_depth, mean_up, navigation, orbit, shortest_path_order, spiral
 from sceneexpander.rendering.config import RenderConfig, ViewKey
@@ -25,10 +25,7 @@ _EVEN = 2  # video codecs with subsampled colour need even sides
 class Tour:
     """Cameras of the video's frames in the reconstruction's own frame."""
 
-    world_from_cam: Float[Tensor, "frame 4 4"]
-    intrinsics_px: Float[Tensor, "frame 3 3"]
-    height: int
-    width: int
+    cameras: Cameras
     inserted_frame: int  # nearest to the inserted camera
     inserted_camera: str  # method that the inserted camera comes from
 
@@ -69,13 +66,10 @@ def plan_tour(reconstruction: Reconstruction, reference: Reconstruction, config:
             if owner is not reconstruction:
                 poses = same_place(poses, reference, reconstruction)
             intrinsics = cameras.intrinsics_px[cameras.goal].expand(config.frames, 3, 3)
-    height, width = reconstruction.depth.shape[1:]
+    height, width = (int(side) for side in reconstruction.depth.shape[1:])
     height_px, width_px = (_EVEN * max(1, round(side * config.scale / _EVEN)) for side in (height, width))
     return Tour(
-        world_from_cam=poses,
-        intrinsics_px=resize_intrinsics(intrinsics, width_px / width, height_px / height),
-        height=height_px,
-        width=width_px,
+        cameras=Cameras(poses, intrinsics, height, width).resized(height_px, width_px),
         inserted_frame=int((poses - cameras.world_from_cam[cameras.goal]).flatten(1).norm(dim=1).argmin()),
         inserted_camera=owner.method,
     )

@@ -36,12 +36,13 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.source_type import source_type_xmp
-from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed, write_bytes_atomic
+from sceneexpander.artifacts.store import ArtifactError, read_json, read_typed
 from sceneexpander.artifacts.unavailable import unavailable_in
 from sceneexpander.artifacts.views import ViewSet, to_uint8
 from sceneexpander.catalogue import LOOKS, MAIN, STEPS
 from sceneexpander.catalogue.methods import CAPTURED
 from sceneexpander.evaluation.quality import find_failures
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.report.camera_map import camera_map
 from sceneexpander.report.cameras import gathered_cameras
 from sceneexpander.report.course import verdict

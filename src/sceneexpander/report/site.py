@@ -10,10 +10,10 @@ from typing import Any
 
 from sceneexpander.artifacts.metrics import Row, load_row
 from sceneexpander.artifacts.page import ScenePage
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.catalogue import ARROWS, MAIN, Metric, Table
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.table import comparison_table
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.report.media import copy_media, copy_reduced, poster_of
 from sceneexpander.report.page import course_of, fill_scene, timeline
 

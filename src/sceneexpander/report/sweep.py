@@ -9,10 +9,10 @@ from typing import Any
 
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.artifacts.page import MethodPage, RoundPage, ScenePage
-from sceneexpander.artifacts.store import write_bytes_atomic
 from sceneexpander.catalogue import MAIN, Metric, Table
 from sceneexpander.catalogue.methods import method_title
 from sceneexpander.catalogue.metrics import DASH
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.report.media import poster_of
 from sceneexpander.report.site import COMPARED, INDEX, render
 

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sceneexpander.errors import UserError
+from sceneexpander.files import complete_file
 from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
-from sceneexpander.splatting.files import complete_file
 from sceneexpander.splatting.scene import check_finite
 
 Linear = Literal["opacity", "scale"]

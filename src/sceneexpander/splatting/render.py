@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
-from sceneexpander.geometry.rigid import rigid_inverse, rotation_from_quat_wxyz
+from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.splatting.rasterise import rasterise
 from sceneexpander.splatting.settings import MIN_COVERAGE, RasterSettings
 
@@ -26,10 +27,7 @@ class Render:
 
 def render(
     gaussians: Gaussians,
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
-    height: int,
-    width: int,
+    cameras: Cameras,
     *,
     background: Float[Tensor, "3"] | Float[Tensor, "view 3"] | None = None,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
@@ -47,10 +45,10 @@ def render(
         gaussians.scales,
         gaussians.opacities,
         gaussians.sh,
-        _cam_from_world(world_from_cam),
-        intrinsics_px,
-        height,
-        width,
+        _cam_from_world(cameras),
+        cameras.intrinsics_px,
+        cameras.height,
+        cameras.width,
         features=gaussians.generated.to(gaussians.means.dtype)[:, None],
         background=background,
         settings=replace(settings, antialiased=gaussians.antialiased),
@@ -62,10 +60,7 @@ def render(
 
 def render_normals(
     gaussians: Gaussians,
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
-    height: int,
-    width: int,
+    cameras: Cameras,
     *,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
 ) -> Float[Tensor, "view height width 3"]:
@@ -73,7 +68,7 @@ def render_normals(
 
     A Gaussian's normal is its shortest axis, turned to the camera; pixels blend them like colours and normalise.
     """
-    cam_from_world = _cam_from_world(world_from_cam)
+    cam_from_world = _cam_from_world(cameras)
     shortest = gaussians.scales.argmin(-1)
     axes = rotation_from_quat_wxyz(gaussians.quat_wxyz)
     normals_world = axes.gather(-1, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
@@ -89,9 +84,9 @@ def render_normals(
         gaussians.opacities,
         torch.zeros_like(gaussians.means),
         cam_from_world,
-        intrinsics_px,
-        height,
-        width,
+        cameras.intrinsics_px,
+        cameras.height,
+        cameras.width,
         features=torch.where(away, -normals_cam, normals_cam),
         with_depth=False,
         settings=replace(settings, antialiased=gaussians.antialiased),
@@ -100,11 +95,10 @@ def render_normals(
     return torch.nn.functional.normalize(out.features.movedim(1, -1), dim=-1)
 
 
-def _cam_from_world(world_from_cam: Tensor) -> Tensor:
-    if world_from_cam.ndim != 3 or tuple(world_from_cam.shape[1:]) != (4, 4):
-        raise ValueError(f"world_from_cam has shape {tuple(world_from_cam.shape)}, expected (views, 4, 4)")
+def _cam_from_world(cameras: Cameras) -> Tensor:
+    world_from_cam = cameras.world_from_cam
     finite = torch.isfinite(world_from_cam).flatten(1).all(1)
     if not bool(finite.all()):
         row = int((~finite).nonzero()[0, 0])
         raise ValueError(f"world_from_cam row {row} is not finite: {world_from_cam[row].flatten().tolist()}")
-    return rigid_inverse(world_from_cam)
+    return cameras.cam_from_world

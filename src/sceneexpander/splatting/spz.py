@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sceneexpander.errors import UserError
+from sceneexpander.files import complete_file
 from sceneexpander.geometry.gaussians import Gaussians
-from sceneexpander.splatting.files import complete_file
 from sceneexpander.splatting.scene import check_finite
 from sceneexpander.splatting.torch_backend import sh_basis
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from sceneexpander.splatting.files import complete_file
+from sceneexpander.files import complete_file
 
 BT709 = 1  # code of ITU-R BT.709 for colour matrix, primaries and transfer in video streams
 LIMITED_RANGE = 1

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from sceneexpander.artifacts.metrics import MetricsRow, load_row
-from sceneexpander.artifacts.store import to_plain, write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import to_plain, write_json_atomic
 from sceneexpander.catalogue import Table
 from sceneexpander.catalogue.metrics import MEASURED
 from sceneexpander.errors import UserError
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.plainfiles import read_plain_file
 from sceneexpander.study.design import make_numpy_generator
 from sceneexpander.study.results import RankedStudy

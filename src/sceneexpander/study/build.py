@@ -16,9 +16,10 @@ from PIL import Image
 
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.scene import Scene
-from sceneexpander.artifacts.store import directory_being_written, sha256_of_file, write_bytes_atomic
+from sceneexpander.artifacts.store import sha256_of_file
 from sceneexpander.artifacts.views import to_uint8
 from sceneexpander.errors import UserError
+from sceneexpander.files import directory_being_written, write_bytes_atomic
 from sceneexpander.plainfiles import require_plain_file
 from sceneexpander.study.design import PlannedScreen, make_numpy_generator, plan_screens
 from sceneexpander.study.document import ANSWERS_NAME, LINKS_NAME, Participant, Screen, Study, StudyScene

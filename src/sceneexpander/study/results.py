@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sceneexpander.artifacts.store import to_plain, write_bytes_atomic, write_json_atomic
+from sceneexpander.artifacts.store import to_plain, write_json_atomic
 from sceneexpander.catalogue import Table
 from sceneexpander.errors import UserError
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.study.document import ANSWERS_NAME, Participant, Study
 from sceneexpander.study.spec import LETTERS, Criterion
 from sceneexpander.study.statistics import (

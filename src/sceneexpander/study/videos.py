@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from sceneexpander.errors import UserError
+from sceneexpander.files import complete_file
 from sceneexpander.plainfiles import require_plain_file
-from sceneexpander.splatting.files import complete_file
 from sceneexpander.splatting.video import write_video
 
 PLAYABLE = ("h264", "vp9", "av1")  # in MP4, by every current browser

@@ -17,9 +17,6 @@ Layout::
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +26,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from sceneexpander.files import directory_being_written
 from sceneexpander.synthetic import courtyard
 from sceneexpander.synthetic.degrade import auto_exposure, encode_radiance
 from sceneexpander.synthetic.misalign import MisalignedView, Misalignment, misalign
@@ -171,9 +169,7 @@ def _misalignment(scene: BundledScene, names: list[str]) -> dict[str, Any]:
 
 def write_bundled(scene: BundledScene, folder: Path) -> None:
     """Write the folder (see the module docstring); an existing one is replaced only when the new one is complete."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with directory_being_written(folder) as scratch:
         for part in ("captured", "inserted", "truth/depth"):
             (scratch / part).mkdir(parents=True)
         names = [f"captured/view_{index + 1:02d}.jpg" for index in range(len(scene.captured_images))]
@@ -189,16 +185,6 @@ def write_bundled(scene: BundledScene, folder: Path) -> None:
         (scratch / "truth/cameras.json").write_text(json.dumps(_cameras(scene, names), indent=1) + "\n")
         (scratch / "truth/misalignment.json").write_text(json.dumps(_misalignment(scene, names), indent=1) + "\n")
         (scratch / "scene.yaml").write_text(yaml.safe_dump(_DESCRIPTION, sort_keys=False, width=120))
-        for path in scratch.rglob("*"):
-            if path.is_file():
-                with path.open("rb") as handle:
-                    os.fsync(handle.fileno())
-        scratch.chmod(0o755)
-        if folder.exists():
-            shutil.rmtree(folder)
-        scratch.replace(folder)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _write(path: Path, pixels: NDArray[Any]) -> None:

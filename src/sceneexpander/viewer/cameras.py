@@ -17,7 +17,7 @@ _FRUSTUM_LIMITS = (0.02, 0.12)  # of the distance to what is seen, so that it ne
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cameras:
+class ShownCameras:
     """The cameras of a reconstruction, in its own world frame (OpenCV axes, scene units)."""
 
     view_ids: tuple[str, ...]
@@ -30,7 +30,7 @@ class Cameras:
     width: int
 
     @classmethod
-    def of(cls, reconstruction: Reconstruction) -> Cameras:
+    def of(cls, reconstruction: Reconstruction) -> ShownCameras:
         """The cameras of a reconstruction."""
         height, width = reconstruction.depth.shape[1:]
         return cls(
@@ -49,9 +49,9 @@ class Cameras:
         real = (self.posed & ~self.generated).nonzero()[:, 0].tolist()
         return real or list(range(len(self.view_ids)))
 
-    def transformed(self, target_from_source: Similarity) -> Cameras:
+    def transformed(self, target_from_source: Similarity) -> ShownCameras:
         """The same cameras in another frame."""
-        return Cameras(
+        return ShownCameras(
             view_ids=self.view_ids,
             generated=self.generated,
             posed=self.posed,
@@ -63,12 +63,12 @@ class Cameras:
         )
 
 
-def up_direction(cameras: Cameras) -> Float[Tensor, 3]:
+def up_direction(cameras: ShownCameras) -> Float[Tensor, 3]:
     """Where up is, as a unit vector of the world frame, by the captured cameras."""
     return mean_up(cameras.world_from_cam[cameras.captured()])
 
 
-def frustum_length(cameras: Cameras) -> float:
+def frustum_length(cameras: ShownCameras) -> float:
     """How long to draw a camera, scene units: neighbours stay apart, and none hides the scene."""
     posed = cameras.posed.nonzero()[:, 0].tolist() or [0]
     low, high = (share * float(cameras.focus[posed].median()) for share in _FRUSTUM_LIMITS)
@@ -79,7 +79,7 @@ def frustum_length(cameras: Cameras) -> float:
     return min(max(_FRUSTUM_SHARE * float(apart), low), high)
 
 
-def alignment(source: Cameras, target: Cameras) -> Similarity:
+def alignment(source: ShownCameras, target: ShownCameras) -> Similarity:
     """``target_from_source`` by the captured cameras that both have; the identity if they share none.
 
     Methods reconstruct one place each in its own gauge (scale and frame drift a little). Brought together, a switch between them shows

@@ -16,7 +16,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.errors import UserError
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import Similarity
-from sceneexpander.viewer.cameras import Cameras, alignment, frustum_length, up_direction
+from sceneexpander.viewer.cameras import ShownCameras, alignment, frustum_length, up_direction
 from sceneexpander.viewer.gate import check_authority, gate
 from sceneexpander.viewer.packed import visible_weight
 from sceneexpander.viewer.viser_axes import enlargement, viser_camera, viser_picture, viser_splats, widened
@@ -35,13 +35,13 @@ class LiveMethod:
 
     name: str
     gaussians: Gaussians
-    cameras: Cameras  # in the frame that is shown: the common one, enlarged
+    cameras: ShownCameras  # in the frame that is shown: the common one, enlarged
     shown_from_method: Similarity
 
     @classmethod
-    def of(cls, reconstruction: Reconstruction, main: Cameras, *, factor: float, limit: int) -> LiveMethod:
+    def of(cls, reconstruction: Reconstruction, main: ShownCameras, *, factor: float, limit: int) -> LiveMethod:
         """Order, align, enlarge by ``factor``. The weights are only computed where something must be left out."""
-        gaussians, cameras = reconstruction.gaussians, Cameras.of(reconstruction)
+        gaussians, cameras = reconstruction.gaussians, ShownCameras.of(reconstruction)
         if len(gaussians) > limit:
             weight = visible_weight(reconstruction)
             gaussians = gaussians.select(torch.argsort(weight, descending=True, stable=True)[:limit])
@@ -100,7 +100,7 @@ class LiveViewer:
             import viser
         except ImportError:
             raise UserError("viser is not installed", where="viewer", fix="pip install -e .[viewer]") from None
-        common, factor = Cameras.of(reconstructions[-1]), enlargement(reconstructions[-1].gaussians)
+        common, factor = ShownCameras.of(reconstructions[-1]), enlargement(reconstructions[-1].gaussians)
         self._methods = {
             item.method: LiveMethod.of(item, common, factor=factor, limit=limit) for item in reconstructions
         }
@@ -132,7 +132,7 @@ class LiveViewer:
         """Where the server listens."""
         return int(self._server.get_port())
 
-    def cameras(self, method: str) -> Cameras:
+    def cameras(self, method: str) -> ShownCameras:
         """Cameras of a method in the frame that is shown."""
         return self._methods[method].cameras
 

@@ -36,11 +36,12 @@ from torch import Tensor
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import load_artifact, load_fields, refusing, save_artifact
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.splatting import RasterSettings, rasterise, render
 from sceneexpander.splatting.torch_backend import shade
-from sceneexpander.viewer.cameras import Cameras
+from sceneexpander.viewer.cameras import ShownCameras
 
 SCHEMA = "packed-splats/3"
 SPLATS_PER_METHOD = 400_000  # at most: three methods stay below 30 MB of page
@@ -77,7 +78,7 @@ class PackedSplats:
 
     method: str
     model: str
-    cameras: Cameras
+    cameras: ShownCameras
     total: int  # Gaussians of the reconstruction
     worst_view_db: float  # PSNR against all of them, in the one of the method's own views where it is lowest
     origin: tuple[float, float, float]
@@ -111,7 +112,7 @@ class PackedSplats:
             name: facts.pop(name) for name in ("view_ids", "height", "width") if name in facts
         }
         with refusing(folder):
-            cameras = Cameras(**load_fields(Cameras, of_cameras, tensors, folder))
+            cameras = ShownCameras(**load_fields(ShownCameras, of_cameras, tensors, folder))
             return cls(cameras=cameras, **load_fields(cls, facts, tensors, folder, given=("cameras",)))
 
 
@@ -158,7 +159,7 @@ def pack_splats(
         limit: Gaussians to keep at most.
         device: where the weights are computed.
     """
-    cameras = Cameras.of(reconstruction)
+    cameras = ShownCameras.of(reconstruction)
     order = torch.argsort(visible_weight(reconstruction, device=device), descending=True, stable=True)
     order, worst_view_db = _enough(reconstruction, order, limit, device)
     colours = _colours(reconstruction)[order]
@@ -231,7 +232,7 @@ def _enough(
 
     def pictures(gaussians: Gaussians) -> Iterator[tuple[Tensor, Tensor]]:
         for pose, lens in zip(poses, lenses, strict=True):
-            seen = render(gaussians, pose[None], lens[None], height, width)
+            seen = render(gaussians, Cameras(pose[None], lens[None], height, width))
             yield seen.rgb[0].clamp(0, 1), seen.alpha[0] < _OPEN_ALPHA
 
     wanted = list(pictures(scene))

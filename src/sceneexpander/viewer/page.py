@@ -18,7 +18,7 @@ from torch import Tensor
 from sceneexpander.artifacts.views import to_uint8
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.splatting.video import GENERATED_TINT
-from sceneexpander.viewer.cameras import Cameras, alignment, frustum_length, up_direction
+from sceneexpander.viewer.cameras import ShownCameras, alignment, frustum_length, up_direction
 from sceneexpander.viewer.packed import PackedSplats
 
 PICTURE_SIDE_PX = 192  # of the pictures in the frusta
@@ -83,7 +83,7 @@ def viewer_page(
     )
 
 
-def _method(item: ShownMethod, main: Cameras) -> dict[str, Any]:
+def _method(item: ShownMethod, main: ShownCameras) -> dict[str, Any]:
     splats = item.splats
     main_from_method = alignment(splats.cameras, main)
     cameras = splats.cameras.transformed(main_from_method)

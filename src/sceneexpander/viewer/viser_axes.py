@@ -21,7 +21,7 @@ from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
 from sceneexpander.geometry.rigid import quat_wxyz_from_rotation, rigid_inverse, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting.video import GENERATED_TINT
-from sceneexpander.viewer.cameras import Cameras
+from sceneexpander.viewer.cameras import ShownCameras
 
 LEAST_STD_PX = 0.8
 TYPICAL_STD = 0.05  # its square is far from both ends of 16-bit floats, 6e-8 and 65504
@@ -59,7 +59,7 @@ def enlargement(gaussians: Gaussians) -> float:
     return TYPICAL_STD / max(float(gaussians.scales.median()), torch.finfo(torch.float32).tiny)
 
 
-def widened(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
+def widened(gaussians: Gaussians, cameras: ShownCameras) -> Gaussians:
     """Gaussians wide enough for viser to draw them where a window has about the resolution of the views.
 
     It leaves out those of which opacity times the determinant of the 2-D covariance (blurred by 0.3) is below a quarter of a pixel^4; a
@@ -74,7 +74,7 @@ def widened(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
     return replace(gaussians, scales=torch.where(thin, gaussians.scales, gaussians.scales.maximum(least[:, None])))
 
 
-def viser_camera(cameras: Cameras, view: int) -> ViserCamera:
+def viser_camera(cameras: ShownCameras, view: int) -> ViserCamera:
     """One view; what it looks at lies ``focus`` ahead."""
     pose = cameras.world_from_cam[view].double()
     fx, fy = (float(cameras.intrinsics_px[view, i, i]) for i in (0, 1))

@@ -5,72 +5,32 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sceneexpander.adaptation.config import AdaptConfig, EngineConfig, Precision
+from sceneexpander.adaptation.config import EngineConfig, Precision
 from sceneexpander.adaptation.engine import set_up
-from sceneexpander.adaptation.inputs import AdaptationInputs
-from sceneexpander.adaptation.loop import AdaptationResult, adapt
-from sceneexpander.artifacts.anchors import Anchors
+from sceneexpander.adaptation.loop import adapt
 from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.errors import UserError
-from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.layers.block import Block
-from sceneexpander.models.protocol import GEOMETRY_HEADS, Reconstructor
+from sceneexpander.models.protocol import GEOMETRY_HEADS
 from tests.support.tiny_model import TinyReconstructor
-from tests.support.tiny_worldmirror import random_images, tiny_worldmirror
-from tests.unit.models.test_mini import make_model, scene
-
-STEPS = AdaptConfig(
-    observe_every=0, steps=3, learning_rate=1e-3, insertion_probability=1.0, restore_interval=2, restore_rate=0.01
-)
+from tests.worlds.engines import STEPS, adapted_mini, adapted_worldmirror, run_steps
 
 
-def _worldmirror() -> tuple[Reconstructor, AdaptationInputs]:
-    return tiny_worldmirror(), _inputs(tiny_worldmirror(), random_images(5), None)
-
-
-def _mini() -> tuple[Reconstructor, AdaptationInputs]:
-    images, priors = scene(5, 28, 42)
-    return make_model(perturbed=True), _inputs(make_model(perturbed=True), images, priors)
-
-
-def _inputs(model: Reconstructor, images: torch.Tensor, priors: Priors | None) -> AdaptationInputs:
-    captured = None if priors is None else priors.select(range(4))
-    with torch.no_grad():
-        frozen = model.predict(images[:4], captured, heads=GEOMETRY_HEADS)
-    anchors = Anchors(
-        weights_sha256="0",
-        view_ids=("a", "b", "c", "d"),
-        camera_vector=frozen.camera_vector,
-        depth=frozen.depth,
-        depth_conf=frozen.depth_conf,
-        normals=frozen.normals,
-        normals_conf=frozen.normals_conf,
-    )
-    return AdaptationInputs(
-        captured=images[:4], inserted=images[4], anchors=anchors, captured_priors=captured, joint_priors=priors
-    )
-
-
-def _run(make: object, config: AdaptConfig) -> AdaptationResult:
-    model, inputs = make()  # type: ignore[operator]
-    return adapt(model, inputs, config, seed=0)
-
-
-@pytest.mark.parametrize("make", [_worldmirror, _mini], ids=["worldmirror", "mini"])
+@pytest.mark.parametrize("make", [adapted_worldmirror, adapted_mini], ids=["worldmirror", "mini"])
 def test_recomputed_activations_give_the_same_bits(make: object) -> None:
-    plain = _run(make, STEPS)
-    saving = _run(make, replace(STEPS, engine=EngineConfig(checkpoint_activations=True)))
+    plain = run_steps(make, STEPS)
+    saving = run_steps(make, replace(STEPS, engine=EngineConfig(checkpoint_activations=True)))
     assert sha256_of_tensors(plain.student) == sha256_of_tensors(saving.student)
     assert plain.records == saving.records
 
 
-@pytest.mark.parametrize("make", [_worldmirror, _mini], ids=["worldmirror", "mini"])
+@pytest.mark.parametrize("make", [adapted_worldmirror, adapted_mini], ids=["worldmirror", "mini"])
 def test_chunks_of_views_change_nothing_but_rounding(make: object) -> None:
     config = replace(STEPS, steps=1)
-    plain = _run(make, config).records[0]
+    plain = run_steps(make, config).records[0]
     for checkpoint in (False, True):
         engine = EngineConfig(views_per_chunk=1, checkpoint_activations=checkpoint)
-        chunked = _run(make, replace(config, engine=engine)).records[0]
+        chunked = run_steps(make, replace(config, engine=engine)).records[0]
         assert chunked.loss == pytest.approx(plain.loss, rel=1e-5)
         assert chunked.gradient_norm == pytest.approx(plain.gradient_norm, rel=1e-4)
 
@@ -78,7 +38,7 @@ def test_chunks_of_views_change_nothing_but_rounding(make: object) -> None:
 def test_gaussians_among_the_anchors_reach_their_head() -> None:
     config = replace(STEPS, steps=2, insertion_probability=0.0, restore_interval=0)
     for weight, reached in ((0.0, False), (1.0, True)):
-        model, inputs = _mini()
+        model, inputs = adapted_mini()
         before = {name: value.clone() for name, value in model.state_dict().items()}
         result = adapt(model, inputs, replace(config, alpha_gaussian=weight), seed=0)
         moved = [
@@ -88,14 +48,14 @@ def test_gaussians_among_the_anchors_reach_their_head() -> None:
         assert (result.records[-1].anchor_gaussian > 0) == reached
 
 
-@pytest.mark.parametrize("make", [_worldmirror, _mini], ids=["worldmirror", "mini"])
+@pytest.mark.parametrize("make", [adapted_worldmirror, adapted_mini], ids=["worldmirror", "mini"])
 def test_theta_0_on_the_host_changes_no_bit(make: object) -> None:
-    plain = _run(make, STEPS)
-    offloaded = _run(make, replace(STEPS, engine=EngineConfig(start_on_host=True)))
+    plain = run_steps(make, STEPS)
+    offloaded = run_steps(make, replace(STEPS, engine=EngineConfig(start_on_host=True)))
     assert sha256_of_tensors(plain.student) == sha256_of_tensors(offloaded.student)
 
 
-@pytest.mark.parametrize("make", [_worldmirror, _mini], ids=["worldmirror", "mini"])
+@pytest.mark.parametrize("make", [adapted_worldmirror, adapted_mini], ids=["worldmirror", "mini"])
 @pytest.mark.parametrize("checkpoint", [False, True])
 def test_bfloat16_passes_update_float32_masters(make: object, checkpoint: bool) -> None:
     model, inputs = make()  # type: ignore[operator]
@@ -103,7 +63,7 @@ def test_bfloat16_passes_update_float32_masters(make: object, checkpoint: bool) 
     tiny_rate = replace(STEPS, precision=Precision.BF16, learning_rate=1e-6, weight_decay=0.0, engine=engine)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     result = adapt(model, inputs, tiny_rate, seed=0)
-    full = _run(make, replace(tiny_rate, precision=Precision.FP32))
+    full = run_steps(make, replace(tiny_rate, precision=Precision.FP32))
     assert result.records[0].loss == pytest.approx(full.records[0].loss, rel=0.2, abs=2e-3)
     assert {value.dtype for value in result.student.values()} == {torch.float32}
     moved = [not torch.equal(before[name], value) for name, value in result.student.items()]
@@ -112,7 +72,7 @@ def test_bfloat16_passes_update_float32_masters(make: object, checkpoint: bool) 
 
 
 def test_outputs_of_a_bfloat16_pass_are_float32() -> None:
-    for make in (_worldmirror, _mini):
+    for make in (adapted_worldmirror, adapted_mini):
         model, inputs = make()
         with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
             prediction = model.predict(inputs.captured, inputs.captured_priors, heads=GEOMETRY_HEADS)
@@ -124,8 +84,8 @@ def test_compiled_blocks_give_the_same_numbers(monkeypatch: pytest.MonkeyPatch) 
     compiled = Block.compile
     monkeypatch.setattr(Block, "compile", lambda self, **options: compiled(self, backend="eager", **options))
     two = replace(STEPS, steps=2)
-    plain = _run(_worldmirror, two)
-    fast = _run(_worldmirror, replace(two, engine=EngineConfig(compile=True)))
+    plain = run_steps(adapted_worldmirror, two)
+    fast = run_steps(adapted_worldmirror, replace(two, engine=EngineConfig(compile=True)))
     for ours, reference in zip(fast.records, plain.records, strict=True):
         assert ours.loss == pytest.approx(reference.loss, rel=1e-4)
 

@@ -13,46 +13,13 @@ from sceneexpander.adaptation.inputs import AdaptationInputs
 from sceneexpander.adaptation.loop import Run, adapt
 from sceneexpander.adaptation.objective import StepLosses
 from sceneexpander.adaptation.sampling import Batch
-from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.gauge import in_gauge_of, poses_relative_to
-from sceneexpander.geometry.priors import Priors
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.models.protocol import Reconstructor
 from tests.support.gauged_model import GaugedReconstructor, gauged_scene
+from tests.worlds.gauges import enlarged, inputs_of
 
 LOSSES = AdaptConfig(observe_every=0, checkpoint_every=0)
-
-
-def enlarged(priors: Priors, factor: float) -> Priors:
-    assert priors.world_from_cam is not None
-    assert priors.depth is not None
-    poses = priors.world_from_cam.clone()
-    poses[:, :3, 3] *= factor
-    return replace(priors, world_from_cam=poses, depth=priors.depth * factor)
-
-
-def inputs_of(captured: int, factor: float) -> AdaptationInputs:
-    """A scene whose joint estimate has another scale."""
-    images, priors = gauged_scene(captured + 1)
-    alone = priors.select(range(captured))
-    with torch.no_grad():
-        frozen = GaugedReconstructor().predict(images[:captured], alone)
-    anchors = Anchors(
-        weights_sha256="0",
-        view_ids=tuple(f"{i}" for i in range(captured)),
-        camera_vector=frozen.camera_vector,
-        depth=frozen.depth,
-        depth_conf=frozen.depth_conf,
-        normals=frozen.normals,
-        normals_conf=frozen.normals_conf,
-    )
-    return AdaptationInputs(
-        captured=images[:captured],
-        inserted=images[captured],
-        anchors=anchors,
-        captured_priors=alone,
-        joint_priors=enlarged(priors, factor),
-    )
 
 
 def losses(inputs: AdaptationInputs, batch: Batch, config: AdaptConfig) -> StepLosses:

@@ -18,9 +18,9 @@ from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.mini import MiniConfig
 from sceneexpander.models.mini.inputs import PreparedViews
 from tests.support.gauged_model import GaugedReconstructor
-from tests.unit.adaptation.test_engine import _inputs
-from tests.unit.adaptation.test_gauge import inputs_of
-from tests.unit.models.test_mini import TINY, make_model, scene
+from tests.worlds.engines import inputs_for
+from tests.worlds.gauges import inputs_of
+from tests.worlds.small_mini import TINY, make_model, scene
 
 ALWAYS = AugmentConfig(identity=0, global_affine=0.4, blockwise=0.3, global_and_block=0.3)
 STEPS = AdaptConfig(observe_every=0, checkpoint_every=0, steps=3, learning_rate=1e-3, augment=ALWAYS)
@@ -29,7 +29,7 @@ BATCH = Batch(captured=(0, 2, 3), inserted=True)
 
 def mini_inputs(config: MiniConfig = TINY) -> AdaptationInputs:
     images, priors = scene(5, 56, 84)
-    return _inputs(make_model(perturbed=True, config=config), images, priors)
+    return inputs_for(make_model(perturbed=True, config=config), images, priors)
 
 
 def prepared(inputs: AdaptationInputs, config: AdaptConfig, *, plain: bool = False) -> PreparedViews:

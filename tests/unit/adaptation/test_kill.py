@@ -15,7 +15,7 @@ import pytest
 from sceneexpander.adaptation.loop import StepRecord, adapt
 from sceneexpander.artifacts.store import sha256_of_tensors, write_json_atomic
 from tests.support.tiny_model import TinyReconstructor
-from tests.unit.adaptation.test_loop import FAST, _inputs
+from tests.worlds.adaptation import FAST, inputs_for
 
 STEPS = 100
 KILLS = 20
@@ -29,7 +29,7 @@ def run_adaptation(folder: Path, steps: Connection) -> None:
 
     config = replace(FAST, steps=STEPS, checkpoint_every=1, observe_every=7)
     result = adapt(
-        TinyReconstructor(), _inputs(), config, seed=0, checkpoint_folder=folder / "checkpoint", on_step=on_step
+        TinyReconstructor(), inputs_for(), config, seed=0, checkpoint_folder=folder / "checkpoint", on_step=on_step
     )
     hashes = {"student": sha256_of_tensors(result.student)}
     log = {"records": list(result.records), "looks": list(result.looks)}

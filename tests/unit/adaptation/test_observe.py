@@ -11,7 +11,7 @@ from sceneexpander.adaptation.loop import adapt
 from sceneexpander.adaptation.observe import HARM_DB, MOST_DB, Look, psnr_db, spread, warnings_of
 from sceneexpander.artifacts.store import sha256_of_tensors
 from tests.support.tiny_model import TinyReconstructor
-from tests.unit.adaptation.test_loop import FAST, _inputs
+from tests.worlds.adaptation import FAST, inputs_for
 
 WATCHED = replace(FAST, observe_every=3)
 
@@ -28,8 +28,8 @@ def _look(step: int, captured_psnr: float) -> Look:
 
 
 def test_looks_change_no_bit_of_the_run(tmp_path: Path) -> None:
-    blind = adapt(TinyReconstructor(), _inputs(), FAST, seed=0)
-    watched = adapt(TinyReconstructor(), _inputs(), WATCHED, seed=0, looks_folder=tmp_path)
+    blind = adapt(TinyReconstructor(), inputs_for(), FAST, seed=0)
+    watched = adapt(TinyReconstructor(), inputs_for(), WATCHED, seed=0, looks_folder=tmp_path)
     assert sha256_of_tensors(blind.student) == sha256_of_tensors(watched.student)
     assert blind.records == watched.records
     assert blind.looks == ()
@@ -39,7 +39,7 @@ def test_looks_come_before_between_and_after(tmp_path: Path) -> None:
     seen: list[int] = []
     result = adapt(
         TinyReconstructor(),
-        _inputs(),
+        inputs_for(),
         WATCHED,
         seed=0,
         on_look=lambda look: seen.append(look.step),
@@ -64,7 +64,7 @@ def test_looks_come_before_between_and_after(tmp_path: Path) -> None:
 
 
 def test_the_first_look_of_the_frozen_model_is_at_its_anchors_but_for_the_inserted_view() -> None:
-    inputs = _inputs()
+    inputs = inputs_for()
     same = replace(inputs, inserted=inputs.captured.mean(0))
     look = adapt(TinyReconstructor(), same, replace(WATCHED, steps=1), seed=0).looks[0]
     assert look.captured_depth_change < 0.05
@@ -79,9 +79,9 @@ def test_a_resumed_run_keeps_the_looks_of_its_past(tmp_path: Path) -> None:
             raise Killed
 
     with pytest.raises(Killed):
-        adapt(TinyReconstructor(), _inputs(), WATCHED, seed=0, checkpoint_folder=tmp_path, on_look=kill)
-    resumed = adapt(TinyReconstructor(), _inputs(), WATCHED, seed=0, checkpoint_folder=tmp_path)
-    assert resumed.looks == adapt(TinyReconstructor(), _inputs(), WATCHED, seed=0).looks
+        adapt(TinyReconstructor(), inputs_for(), WATCHED, seed=0, checkpoint_folder=tmp_path, on_look=kill)
+    resumed = adapt(TinyReconstructor(), inputs_for(), WATCHED, seed=0, checkpoint_folder=tmp_path)
+    assert resumed.looks == adapt(TinyReconstructor(), inputs_for(), WATCHED, seed=0).looks
 
 
 @pytest.mark.parametrize(("values", "harmed"), [([20, 19.8, 21], False), ([20, 19.4, 20.5], True), ([], False)])

@@ -16,9 +16,9 @@ from sceneexpander.artifacts.state import WeightsChange
 from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.errors import UserError
 from tests.support.tiny_model import TinyReconstructor
-from tests.unit.adaptation.test_engine import STEPS, _mini, _run, _worldmirror
+from tests.worlds.engines import STEPS, adapted_mini, adapted_worldmirror, run_steps
 
-MAKERS = pytest.mark.parametrize("make", [_worldmirror, _mini], ids=["worldmirror", "mini"])
+MAKERS = pytest.mark.parametrize("make", [adapted_worldmirror, adapted_mini], ids=["worldmirror", "mini"])
 LORA, HEADS = (replace(STEPS, trainable=kind, lora_rank=3) for kind in (Trainable.LORA, Trainable.HEADS))
 
 
@@ -70,11 +70,13 @@ def test_a_low_rank_layer_is_the_merged_layer() -> None:
 
 
 def test_lora_repeats_and_resumes(tmp_path: Path) -> None:
-    assert sha256_of_tensors(_run(_mini, LORA).student) == sha256_of_tensors(_run(_mini, LORA).student)
-    model, inputs = _mini()
+    assert sha256_of_tensors(run_steps(adapted_mini, LORA).student) == sha256_of_tensors(
+        run_steps(adapted_mini, LORA).student
+    )
+    model, inputs = adapted_mini()
     every = replace(LORA, checkpoint_every=1)
     whole = adapt(model, inputs, every, seed=0, checkpoint_folder=tmp_path / "point")
-    model, inputs = _mini()
+    model, inputs = adapted_mini()
     steps: list[int] = []
     resumed = adapt(
         model, inputs, every, seed=0, checkpoint_folder=tmp_path / "point", on_step=lambda r: steps.append(r.step)
@@ -126,7 +128,7 @@ def test_the_plateau_waits_until_the_inserted_view_was_seen() -> None:
 
 
 def test_stopping_early_reports_the_steps_saved_and_looks_once_more() -> None:
-    model, inputs = _mini()
+    model, inputs = adapted_mini()
     never_better = PlateauConfig(window=1, tolerance=0.99)
     config = replace(STEPS, steps=9, observe_every=5, plateau=never_better)
     result = adapt(model, inputs, config, seed=0)

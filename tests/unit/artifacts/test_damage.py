@@ -49,8 +49,8 @@ from sceneexpander.artifacts.views import LensFacts, ViewSet
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
 from sceneexpander.viewer.packed import PackedSplats, pack_splats
-from tests.unit.artifacts.test_artifacts import make_reconstruction, make_views
-from tests.unit.evaluation.made import made_reconstruction
+from tests.worlds.artifacts import make_reconstruction, make_views
+from tests.worlds.wall import made_reconstruction
 
 
 def lens_views() -> ViewSet:

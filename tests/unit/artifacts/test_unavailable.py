@@ -10,7 +10,7 @@ from sceneexpander.artifacts.metrics import MetricsRow, UnavailableRow, load_row
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.artifacts.unavailable import Unavailable, passed_on, unavailable_in
-from tests.unit.evaluation.made import made_reconstruction
+from tests.worlds.wall import made_reconstruction
 
 REASON = Unavailable(method="ttt3r", model="ttt3r", reason="needs the public checkpoint")
 

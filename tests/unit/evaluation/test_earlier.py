@@ -11,7 +11,7 @@ from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.earlier import EarlierRegions
 from sceneexpander.evaluation.measure import Subject, Values
-from tests.unit.evaluation.made import made_reconstruction, own_pictures
+from tests.worlds.wall import made_reconstruction, own_pictures
 
 CONFIG = EvaluateConfig(st_lpips=False, cross_view=False)
 EYES = (0.0, 0.3, 2.2, 4.0)  # the last two were inserted, in rounds 1 and 2

@@ -14,7 +14,7 @@ from sceneexpander.evaluation.evaluate import evaluate
 from stages import layout
 from stages.evaluate import fit_of
 from stages.runner import Cell
-from tests.unit.evaluation.made import made_reconstruction, own_pictures
+from tests.worlds.wall import made_reconstruction, own_pictures
 
 
 @pytest.mark.parametrize(

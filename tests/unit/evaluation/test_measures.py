@@ -16,11 +16,11 @@ from sceneexpander.evaluation import evaluate as module
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate, register_measure
 from sceneexpander.evaluation.measure import Measure, SeenView, Subject, Values
+from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.report import write_page
-from sceneexpander.selection import Selection, read_selection
 from sceneexpander.tracking import scene_runs
-from tests.unit.evaluation.made import made_reconstruction, own_pictures
-from tests.unit.report.test_page import gathered, source  # noqa: F401 - fixtures
+from tests.worlds.reports import gathered, source  # noqa: F401 - fixtures
+from tests.worlds.wall import made_reconstruction, own_pictures
 
 BRIGHTNESS = Metric(
     name="brightness_captured",

@@ -13,8 +13,9 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
 from sceneexpander.evaluation.sizes import at_sizes
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import render
-from tests.unit.evaluation.made import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
+from tests.worlds.wall import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
 
 CONFIG = EvaluateConfig(st_lpips=False)
 PIXEL = DEPTH / 40
@@ -35,7 +36,9 @@ def scene(std_px: float, *, antialiased: bool) -> Reconstruction:
 
 def photo_of(made: Reconstruction, times: int) -> torch.Tensor:
     lens = resize_intrinsics(made.intrinsics_px[:1], times, times)
-    return render(made.gaussians, made.world_from_cam[:1], lens, times * HEIGHT, times * WIDTH).rgb[0].clamp(0, 1)
+    return (
+        render(made.gaussians, Cameras(made.world_from_cam[:1], lens, times * HEIGHT, times * WIDTH)).rgb[0].clamp(0, 1)
+    )
 
 
 def test_dust_is_found_where_the_stored_size_hides_it() -> None:

@@ -24,7 +24,7 @@ from sceneexpander.evaluation.truth import TruthMetrics, against_truth
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.ingest.truth import check_truth, load_truth
-from tests.unit.evaluation.made import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
+from tests.worlds.wall import DEPTH, HEIGHT, WIDTH, made_reconstruction, own_pictures
 
 EYES = (0.0, 0.4, 0.9, 2.0)
 

@@ -17,12 +17,11 @@ from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import MEASURES, evaluate
 from sceneexpander.evaluation.image import psnr
-from sceneexpander.evaluation.measure import Navigation
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.evaluation.views import measure_views, navigation_coverage, same_place
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
-from tests.unit.evaluation.made import HEIGHT, WIDTH, made_reconstruction, own_pictures, without_generated
+from tests.worlds.wall import HEIGHT, WIDTH, made_reconstruction, own_pictures, without_generated
 
 CONFIG = EvaluateConfig()
 
@@ -122,9 +121,8 @@ def test_one_view_has_no_others() -> None:
 def test_coverage_gained_by_the_expansion() -> None:
     scene = made_reconstruction()
     before = without_generated(scene)
-    poses, intrinsics = scene.world_from_cam[2:], scene.intrinsics_px[2:]
-    after_share = navigation_coverage(scene, poses, intrinsics, HEIGHT, WIDTH, CONFIG)
-    before_share = navigation_coverage(before, poses, intrinsics, HEIGHT, WIDTH, CONFIG)
+    after_share = navigation_coverage(scene, scene.cameras[2:], CONFIG)
+    before_share = navigation_coverage(before, scene.cameras[2:], CONFIG)
     # Each view spans 3.15 of the wall; seen from 2.2, the view from 0.3 reaches (3.15 - 1.9) / 3.15 = 40 % of it.
     assert float(before_share[0]) == pytest.approx(0.4, abs=0.06)
     assert float(after_share[0]) > 0.95
@@ -155,10 +153,7 @@ def test_sizes_must_agree() -> None:
 
 def test_row_holds_everything_and_survives_the_disk(tmp_path: Path) -> None:
     scene = made_reconstruction()
-    navigation = Navigation(
-        world_from_cam=scene.world_from_cam, intrinsics_px=scene.intrinsics_px, height=HEIGHT, width=WIDTH
-    )
-    row = evaluate(scene, own_pictures(scene), CONFIG, scene="made", round_number=1, seed=0, navigation=navigation)
+    row = evaluate(scene, own_pictures(scene), CONFIG, scene="made", round_number=1, seed=0, navigation=scene.cameras)
     assert [row.value(name) for name in ("views_captured", "views_generated", "tour_frames")] == [2, 1, 3]
     assert row.value("gaussians") == 3 * HEIGHT * WIDTH
     assert row.value("gaussians_generated") == HEIGHT * WIDTH

@@ -12,7 +12,7 @@ from sceneexpander import ablation
 from sceneexpander.expandbench.document import READING, Results, written
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings
 from sceneexpander.expandbench.studies import STUDIES
-from tests.unit.expandbench.test_table import cell
+from tests.worlds.cells import cell
 
 ROOT = Path(__file__).parents[3]
 

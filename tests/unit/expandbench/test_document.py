@@ -18,7 +18,7 @@ from sceneexpander.expandbench.scenes import DEVELOPMENT, SCENES, TEST
 from sceneexpander.expandbench.studies import STUDIES
 from sceneexpander.insertion.contradiction import Contradiction
 from tests.support.methods import make_method
-from tests.unit.expandbench.test_table import cell
+from tests.worlds.cells import cell
 
 ROOT = Path(__file__).parents[3]
 PAGE, FILE = ROOT / "docs" / "ablation.md", ROOT / "results" / "ablation.json"

@@ -13,7 +13,7 @@ from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.expandbench import prepared as module
 from sceneexpander.expandbench.grades import GRADES
 from sceneexpander.frontend.prior import FrontendConfig
-from tests.unit.artifacts.test_artifacts import make_views
+from tests.worlds.artifacts import make_views
 
 
 class Asked(Exception):

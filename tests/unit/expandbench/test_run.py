@@ -13,7 +13,7 @@ from sceneexpander.expansion import MethodConfig, ModelConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.photometric.config import RefineConfig, WarmupConfig
 from tests.support.methods import make_method
-from tests.unit.expandbench.test_table import NUMBERS
+from tests.worlds.cells import NUMBERS
 
 PLAN = Plan(
     scenes=("room_1", "open_1"),

@@ -40,7 +40,7 @@ from sceneexpander.reconstruction.views import reconstruct
 from sceneexpander.synthetic import make_views
 from tests.support.gauged_model import GaugedReconstructor
 from tests.support.methods import make_procedure
-from tests.unit.insertion.test_camera import view_set
+from tests.worlds.view_sets import view_set
 
 VIEWS, H, W = 3, 84, 112
 BRIGHT = 1.25

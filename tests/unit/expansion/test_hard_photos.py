@@ -14,6 +14,7 @@ import torch
 from sceneexpander.expansion import LoadedModel, ModelConfig, initial_state, load_model
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.frontend.sfm_types import SfmConfig, SfmReport
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.ingest import IngestConfig, load_scene
@@ -82,7 +83,9 @@ class Reconstructed:
         self.confident = state.priors.evidence[:, CONFIDENT].mean((1, 2))
         self.world_from_cam = found.world_from_cam
         images = scene.views.images
-        drawn = render(found.gaussians, found.world_from_cam, found.intrinsics_px, *images.shape[-2:]).rgb.clamp(0, 1)
+        drawn = render(
+            found.gaussians, Cameras(found.world_from_cam, found.intrinsics_px, *images.shape[-2:])
+        ).rgb.clamp(0, 1)
         self.psnr = -10 * (drawn - images).square().mean((1, 2, 3)).log10()
         self.finite = bool(torch.isfinite(found.gaussians.means).all() & torch.isfinite(found.world_from_cam).all())
 

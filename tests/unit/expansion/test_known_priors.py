@@ -17,7 +17,7 @@ from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.reconstruction.loaded import LoadedModel, ModelConfig, load_model
 from sceneexpander.reconstruction.views import predict, views_priors
 from tests.support.tiny_worldmirror import tiny_worldmirror
-from tests.unit.expansion.test_told_cameras import known_cameras, read, scene_folder
+from tests.worlds.told_cameras import known_cameras, read, scene_folder
 
 pytestmark = pytest.mark.timeout(300)
 FRONT_END = FrontendConfig(sfm=SfmConfig(learned=LearnedUse.NEVER))

@@ -32,7 +32,7 @@ from sceneexpander.photometric.config import WarmupConfig
 from sceneexpander.photometric.warmup import held_out_cells, warm_up
 from tests.support.methods import make_procedure
 from tests.support.tiny_model import TinyReconstructor, tiny_images
-from tests.unit.artifacts.test_artifacts import make_views
+from tests.worlds.artifacts import make_views
 
 CONFIG = AdaptConfig(steps=4, learning_rate=1e-3)
 

@@ -21,12 +21,13 @@ from sceneexpander.exports.mesh import make_collider, make_mesh
 from sceneexpander.exports.scene import Crop, ExportScene, crop_scene, load_scene, place_scene
 from sceneexpander.exports.write import write_exports
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting import render
 from sceneexpander.splatting.ply import read_ply
 from sceneexpander.splatting.spz import read_spz
-from tests.unit.exports.scenes import DEPTH, FINER, GENERATED, HEIGHT, VIEWS, WIDTH, poses, save_finished
+from tests.worlds.exported import DEPTH, FINER, GENERATED, HEIGHT, VIEWS, WIDTH, poses, save_finished
 
 NAMES = tuple(item.name for item in FORMATS)
 MOVED = Similarity(
@@ -59,7 +60,7 @@ def written(scene: ExportScene, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def seen(scene: ExportScene) -> torch.Tensor:
     made = scene.reconstruction
-    return render(made.gaussians, made.world_from_cam, made.intrinsics_px, HEIGHT, WIDTH).rgb
+    return render(made.gaussians, Cameras(made.world_from_cam, made.intrinsics_px, HEIGHT, WIDTH)).rgb
 
 
 def seen_of(scene: ExportScene, path: Path) -> torch.Tensor:

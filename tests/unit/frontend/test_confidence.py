@@ -11,9 +11,9 @@ import torch
 
 from sceneexpander.frontend.confidence import FEATURES, RIGHT, ConfidenceModel, confidence_features, shipped_model
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
-from sceneexpander.models.mini.training.confidence import calibration, fit_confidence, pixels_of_sample
-from sceneexpander.models.mini.training.generate import Conditions, sample_of_scene
 from sceneexpander.synthetic.views import make_views
+from sceneexpander.training.confidence import calibration, fit_confidence, pixels_of_sample
+from sceneexpander.training.generate import Conditions, sample_of_scene
 
 
 def test_the_regression_finds_the_odds_that_made_the_data() -> None:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, DenseDepth, checked_share, dense_depth
-from sceneexpander.frontend.simulated import perturb_poses, sample_sparse_points
 from sceneexpander.frontend.sparse_points import SparsePoints
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
+from sceneexpander.training.simulated import perturb_poses, sample_sparse_points
 
 CONFIG = DenseConfig(threads=1)
 HEIGHT, WIDTH = 96, 128

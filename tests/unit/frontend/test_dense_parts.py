@@ -9,10 +9,10 @@ import torch
 from sceneexpander.frontend.fill import interpolate_sparse, pixels_to_nearest, segment_planes, smooth_fill
 from sceneexpander.frontend.segments import segment_colours
 from sceneexpander.frontend.sgm import COST_SCALE, aggregate, best_hypothesis
-from sceneexpander.frontend.simulated import perturb_poses, sample_sparse_points
 from sceneexpander.frontend.sparse_points import SparsePoints
 from sceneexpander.geometry.camera import project_points
 from sceneexpander.geometry.rigid import rotation_angle_deg
+from sceneexpander.training.simulated import perturb_poses, sample_sparse_points
 
 
 def slow_aggregate(cost: np.ndarray, guide: np.ndarray, near: float, jump: float, contrast: float) -> np.ndarray:

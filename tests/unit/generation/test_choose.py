@@ -19,7 +19,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.generation import ChoiceConfig, ChosenView, GeneratorConfig, check_round, choose_view, make_generator
 from sceneexpander.generation.backends.stored import FileConfig, ReplayConfig
 from sceneexpander.ingest import IngestConfig, load_scene
-from tests.unit.generation.rounds import context_of, flat_scene, photo
+from tests.worlds.rounds import context_of, flat_scene, photo
 
 CONFIG = IngestConfig(long_side_px=84)
 REPLAY = ReplayConfig()

@@ -18,7 +18,7 @@ from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.generation import GenerationContext, SceneSoFar, make_generator
 from tests.unit.generation.loopback import Answer, Asked, Service, drawn, said, serving
-from tests.unit.generation.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
+from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
 
 CONF = Path(__file__).parents[3] / "conf"
 WORKFLOW: dict[str, Any] = {

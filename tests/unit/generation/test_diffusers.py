@@ -20,7 +20,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.generation import GenerationContext, SceneSoFar, make_generator
 from sceneexpander.generation.backends.diffusers import folder_identity, sampled_size
 from sceneexpander.ingest.decode import decode_picture
-from tests.unit.generation.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
+from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
 
 CONF = Path(__file__).parents[3] / "conf"
 

@@ -23,7 +23,7 @@ from sceneexpander.generation import (
     make_generator,
 )
 from sceneexpander.pipeline.preflight import check_scene
-from tests.unit.ingest.test_survey import photos
+from tests.worlds.photos import photos
 
 CONF = Path(__file__).parents[3] / "conf"
 

@@ -21,7 +21,7 @@ from sceneexpander.generation import GenerationContext, SceneSoFar
 from sceneexpander.generation.backends.gemini import GeminiConfig, GeminiService, nearest_ratio
 from sceneexpander.generation.service import ServiceGenerator
 from tests.unit.generation.loopback import Answer, Service, drawn, said, serving
-from tests.unit.generation.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
+from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
 
 CONF = Path(__file__).parents[3] / "conf"
 KEY = "AIzaverysecret0123456789"

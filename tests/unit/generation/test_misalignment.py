@@ -11,13 +11,13 @@ from PIL import Image
 
 from sceneexpander.artifacts.agreement import MisalignmentReport
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
-from sceneexpander.artifacts.store import directory_being_written
+from sceneexpander.files import directory_being_written
 from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.misalignment import report_misalignment
 from sceneexpander.ingest.fit import FittedPicture, fit_picture
-from tests.unit.generation.rounds import flat_scene, made_views
-from tests.unit.generation.test_rank import HEIGHT, WIDTH, blobs, tensor, view_of_wall
+from tests.worlds.painted_wall import HEIGHT, WIDTH, blobs, tensor, view_of_wall
+from tests.worlds.rounds import flat_scene, made_views
 
 
 @pytest.fixture(scope="module")

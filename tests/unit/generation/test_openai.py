@@ -26,7 +26,7 @@ from sceneexpander.generation import ChoiceConfig, GenerationContext, SceneSoFar
 from sceneexpander.generation.backends.openai import OpenAIConfig, OpenAIService, asked_size
 from sceneexpander.generation.service import ServiceGenerator
 from tests.unit.generation.loopback import Answer, Service, drawn, error, picture, said, serving
-from tests.unit.generation.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
+from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
 
 CONF = Path(__file__).parents[3] / "conf"
 KEY = "sk-verysecret0123456789"

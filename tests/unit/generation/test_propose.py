@@ -11,7 +11,7 @@ import torch
 from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.motion import parse_motion
 from sceneexpander.generation.propose import FEWEST_NEW, FEWEST_SEEN, measure_coverage, propose_motions
-from tests.unit.evaluation.made import HEIGHT, WIDTH, made_reconstruction, own_pictures
+from tests.worlds.wall import HEIGHT, WIDTH, made_reconstruction, own_pictures
 
 
 def scene(eyes_x: tuple[float, ...] = (0.0, 0.3)) -> SceneSoFar:

@@ -17,7 +17,7 @@ from sceneexpander.generation import ChoiceConfig, SceneSoFar, choose_view
 from sceneexpander.generation.backends.reproject import ReprojectConfig, ReprojectGenerator, fill_unseen
 from sceneexpander.ingest import decode_picture
 from sceneexpander.ingest.load import image_tensor
-from tests.unit.generation.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
+from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.ingest import IngestConfig, load_photos, make_round
 from sceneexpander.ingest.bars import Bars, find_bars, find_overlay
 from sceneexpander.ingest.fit import FrameSize, fit_picture
-from tests.unit.ingest.test_survey import texture
+from tests.worlds.photos import texture
 
 CONFIG = IngestConfig(long_side_px=112)
 ROUNDS = [make_round("A bench stands behind the table.")]

@@ -25,7 +25,7 @@ from sceneexpander.ingest.depth_files import DepthFile, DepthFormat
 from sceneexpander.ingest.lens_models import Lens, Projection, straighten_picture
 from sceneexpander.ingest.sources import SOURCES, Capture, Shot, find_source, read_capture
 from sceneexpander.ingest.sources.posed import write_posed_photos
-from tests.unit.ingest.test_survey import texture
+from tests.worlds.photos import texture
 
 pytestmark = pytest.mark.timeout(120)
 CONFIG = IngestConfig(long_side_px=112)

@@ -14,29 +14,12 @@ from sceneexpander.errors import UserError
 from sceneexpander.ingest import IngestConfig, load_photos, make_round, read_views, survey_pictures
 from sceneexpander.ingest.copies import is_copy, thumbnail
 from sceneexpander.ingest.panorama import panorama_reason
+from tests.worlds.photos import photos, texture
 
 pytestmark = pytest.mark.timeout(60)
 CONFIG = IngestConfig(long_side_px=112)
 ROUNDS = [make_round("A bench stands behind the table.")]
 VIDEO, RAW = b"\0\0\0\x14ftypqt  " + bytes(100), b"II*\0\x08\0\0\0" + bytes(100)
-
-
-def texture(seed: int, height: int = 180, width: int = 240, cells: int = 24) -> Image.Image:
-    """A picture with structure of several sizes, another one for each seed."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros((height, width, 3))
-    for count in (4, 9, cells):
-        coarse = Image.fromarray(rng.integers(0, 255, (count, count + 3, 3), dtype=np.uint8))
-        total += np.asarray(coarse.resize((width, height), Image.Resampling.BICUBIC), dtype=np.float64) / 3
-    return Image.fromarray(total.astype(np.uint8))
-
-
-def photos(folder: Path, count: int = 3, suffix: str = ".jpg") -> list[Path]:
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{k}{suffix}" for k in range(count)]
-    for seed, path in enumerate(paths):
-        texture(seed).save(path, quality=95)
-    return paths
 
 
 def load_line(folder: Path) -> str:

@@ -11,9 +11,7 @@ import torch
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.insertion.acceptance import Acceptance, AcceptanceLimits, captured_moved, judge_candidate
-from tests.unit.insertion.test_realign import VIEWS, moved, world
-
-__all__ = ["world"]  # the fixture
+from tests.worlds.realigned import VIEWS, moved
 
 World = tuple[Priors, Anchors, torch.Tensor]
 

@@ -9,27 +9,12 @@ import torch
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.state import ExpansionState, WeightsChange
-from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.expansion import ModelConfig, RoundInputs, load_model
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.insertion.camera import realign_priors
 from sceneexpander.insertion.realign import Realign
-from tests.unit.insertion.test_realign import VIEWS, world
-
-__all__ = ["world"]  # the fixture
-
-
-def view_set(images: torch.Tensor, *, generated: bool) -> ViewSet:
-    height, width = images.shape[-2:]
-    affine = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    records = tuple(
-        ViewRecord(
-            view_id=f"{index}_{generated}", name="x.png", original_height=height, original_width=width, sha256="0",
-            stored_from_original=affine, generated=generated, round=int(generated),
-        )
-        for index in range(len(images))
-    )  # fmt: skip
-    return ViewSet(records=records, images=images, detail_images=images)
+from tests.worlds.realigned import VIEWS
+from tests.worlds.view_sets import view_set
 
 
 def test_the_estimate_that_shows_the_photos_better_is_taken(world: tuple[Priors, Anchors, torch.Tensor]) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.insertion.colour import LARGEST_GAIN, Tone, match_tone
 from sceneexpander.synthetic import SyntheticViews, make_views
 from sceneexpander.synthetic.degrade import encode_radiance
@@ -18,9 +21,13 @@ def views() -> SyntheticViews:
     return make_views(11, views=VIEWS + 1, height=84, width=112, kind="room", degrade=False, split="test")
 
 
+def cameras_of(views: SyntheticViews) -> Cameras:
+    return Cameras(views.world_from_cam, views.intrinsics_px, *views.images.shape[2:])
+
+
 def matched(views: SyntheticViews, images: torch.Tensor, generated: torch.Tensor = GENERATED) -> Tone | None:
     depth = torch.where(views.valid, views.depth, views.depth[views.valid].max())
-    return match_tone(images, depth, views.world_from_cam, views.intrinsics_px, generated=generated, view=VIEWS)
+    return match_tone(images, depth, cameras_of(views), generated=generated, view=VIEWS)
 
 
 def recoloured(views: SyntheticViews, gains: tuple[float, float, float]) -> torch.Tensor:
@@ -68,8 +75,9 @@ def test_generated_views_and_strangers_have_no_say(views: SyntheticViews) -> Non
     assert matched(views, images, torch.ones(VIEWS + 1, dtype=torch.bool)) is None
     away = views.world_from_cam.clone()
     away[VIEWS, :3, 3] += 100.0
+    cameras = replace(cameras_of(views), world_from_cam=away)
     depth = torch.where(views.valid, views.depth, views.depth[views.valid].max())
-    assert match_tone(images, depth, away, views.intrinsics_px, generated=GENERATED, view=VIEWS) is None
+    assert match_tone(images, depth, cameras, generated=GENERATED, view=VIEWS) is None
 
 
 def test_another_scene_is_not_taken_for_another_exposure(views: SyntheticViews) -> None:
@@ -92,10 +100,10 @@ def test_a_photo_without_a_camera_has_no_say(views: SyntheticViews) -> None:
     images = recoloured(views, (1.2, 1.2, 1.2))
     images[0] *= 0.5
     depth = torch.where(views.valid, views.depth, views.depth[views.valid].max())
-    cameras = views.world_from_cam, views.intrinsics_px
+    cameras = cameras_of(views)
 
     def gains(posed: list[bool]) -> Tone | None:
-        return match_tone(images, depth, *cameras, generated=GENERATED, posed=torch.tensor(posed), view=VIEWS)
+        return match_tone(images, depth, cameras, generated=GENERATED, posed=torch.tensor(posed), view=VIEWS)
 
     found = gains([False, True, True, True])
     assert found is not None

@@ -10,6 +10,7 @@ from sceneexpander.adaptation.pixel_weights import inserted_weights
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.agreement import Agreement, agreement
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.insertion.contradiction import LOST, fade_contradicted, pixel_trust
 from sceneexpander.models.pixel_aligned import pixel_aligned
 from sceneexpander.models.protocol import Prediction
@@ -30,7 +31,7 @@ def setup(factor: float, shift: float = 0.0) -> tuple[torch.Tensor, ...]:
 def compared(factor: float, shift: float = 0.0) -> Agreement:
     depth, pose, intrinsics, captured, captured_pose, captured_intrinsics = setup(factor, shift)
     points = unproject_to_world(depth[None], intrinsics[None], pose[None])[0]
-    return agreement(points, captured, captured_pose, captured_intrinsics)
+    return agreement(points, captured, Cameras(captured_pose, captured_intrinsics, HEIGHT, WIDTH))
 
 
 def test_the_same_surface_is_trusted() -> None:
@@ -86,8 +87,7 @@ def scene_of_two(factor: float, colour: float) -> tuple[Reconstruction, torch.Te
         images=images,
         depth=depth,
         depth_conf=torch.full_like(depth, 10.0),
-        world_from_cam=poses,
-        intrinsics_px=intrinsics,
+        cameras=Cameras(poses, intrinsics, *depth.shape[1:]),
         normals=normals,
         generated=generated,
     )

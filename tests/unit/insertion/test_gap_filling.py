@@ -9,6 +9,7 @@ import torch
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.geometry.camera import pixel_centres
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.insertion.gap_filling import close_gaps
 from sceneexpander.models.pixel_aligned import pixel_aligned
@@ -44,8 +45,7 @@ def scene(depth: torch.Tensor, captured_pose: torch.Tensor = AWAY, *, posed: boo
         images=torch.full((2, 3, HEIGHT, WIDTH), 0.5),
         depth=depths,
         depth_conf=confidence,
-        world_from_cam=poses,
-        intrinsics_px=INTRINSICS.expand(2, 3, 3),
+        cameras=Cameras(poses, INTRINSICS.expand(2, 3, 3), HEIGHT, WIDTH),
         generated=generated,
     )
     return Reconstruction(
@@ -64,7 +64,7 @@ def covariances(reconstruction: Reconstruction) -> torch.Tensor:
 
 def least_alpha(reconstruction: Reconstruction) -> float:
     """The most transparent pixel of the floor from above."""
-    shown = render(reconstruction.gaussians, ABOVE[None], INTRINSICS[None], HEIGHT, WIDTH)
+    shown = render(reconstruction.gaussians, Cameras(ABOVE[None], INTRINSICS[None], HEIGHT, WIDTH))
     return float(shown.alpha.min())
 
 
@@ -121,7 +121,7 @@ def test_missing_gaussians_leave_a_hole_that_is_not_bridged() -> None:
     column = index % WIDTH
     hole = (index >= HEIGHT * WIDTH) & (column >= 15) & (column < 25)
     rest = close_gaps(replace(before, gaussians=before.gaussians.select(~hole)), 0.7)
-    shown = render(rest.gaussians, torch.eye(4)[None], INTRINSICS[None], HEIGHT, WIDTH)
+    shown = render(rest.gaussians, Cameras(torch.eye(4)[None], INTRINSICS[None], HEIGHT, WIDTH))
     assert float(shown.alpha[0, 8:24, 18:22].max()) < 0.05
 
 

@@ -16,8 +16,8 @@ from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.opinion import judge_candidates
 from sceneexpander.ingest.fit import FittedPicture, fit_picture
 from tests.unit.generation.loopback import Service, serving
-from tests.unit.generation.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
-from tests.unit.judge.made import KEY, judge_of, refusal, scored
+from tests.worlds.judged import KEY, judge_of, refusal, scored
+from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from sceneexpander.judge import judge_round, make_judge
 from sceneexpander.judge.config import NoJudgeConfig
 from sceneexpander.judge.rounds import questions_of
 from tests.unit.generation.loopback import Answer, Service, error, said, serving
-from tests.unit.judge.made import KEY, judge_of, message, preferred, refusal, scored, settings, work_of
+from tests.worlds.judged import KEY, judge_of, message, preferred, refusal, scored, settings, work_of
 
 
 @pytest.fixture

@@ -18,13 +18,13 @@ from sceneexpander.config.files import write_yaml
 from sceneexpander.errors import UserError
 from sceneexpander.judge_run import judge_run, parse_arguments
 from sceneexpander.pipeline.preflight import check_scene
-from sceneexpander.project import JUDGED_FOLDER, ROOT_ENV
+from sceneexpander.pipeline.project import JUDGED_FOLDER, ROOT_ENV
 from sceneexpander.splatting.video import write_video
 from stages import judge as judge_stage
 from stages.runner import Cell
 from tests.unit.generation.loopback import Service, serving
-from tests.unit.generation.rounds import made_views
-from tests.unit.judge.made import CONF, KEY, scored
+from tests.worlds.judged import CONF, KEY, scored
+from tests.worlds.rounds import made_views
 
 METHODS = ("captured", "backbone", "omnivggt")
 

@@ -12,17 +12,20 @@ from sceneexpander.errors import UserError
 from sceneexpander.frontend.dense import DenseConfig
 from sceneexpander.frontend.prior import FrontendConfig
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gauge import priors_relative_to
 from sceneexpander.geometry.normals import normals_from_depth
-from sceneexpander.geometry.priors import EVIDENCE_CHANNELS, Priors
-from sceneexpander.geometry.rigid import rigid_from_parts, rigid_inverse, rotation_from_quat_wxyz
-from sceneexpander.models.mini import Mini, MiniConfig
+from sceneexpander.geometry.rigid import rigid_inverse
+from sceneexpander.models.mini import Mini
 from sceneexpander.models.mini.inputs import working_size
 from sceneexpander.models.mini.pairs import PairGeometry, splat_log_depth
 from sceneexpander.models.mini.splats import covered_by_others
-from sceneexpander.models.mini.training.augment import augment, mirrored
-from sceneexpander.models.mini.training.buffer import samples_folder
-from sceneexpander.models.mini.training.generate import (
+from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor
+from sceneexpander.models.registry import build_reconstructor
+from sceneexpander.synthetic.views import make_views
+from sceneexpander.training.augment import augment, mirrored
+from sceneexpander.training.buffer import samples_folder
+from sceneexpander.training.generate import (
     Conditions,
     GeneratorConfig,
     in_scale_of_base,
@@ -31,61 +34,18 @@ from sceneexpander.models.mini.training.generate import (
     sample_of_scene,
     training_sample,
 )
-from sceneexpander.models.mini.training.losses import (
+from sceneexpander.training.losses import (
     confidence_loss,
     depth_loss,
     log_depth_error,
     render_loss,
     scale_loss,
 )
-from sceneexpander.models.mini.training.measure import geometry_row
-from sceneexpander.models.mini.training.sample import Sample
-from sceneexpander.models.mini.training.scores import scene_samples
-from sceneexpander.models.mini.training.trainer import LossWeights, TrainConfig, Trainer
-from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor
-from sceneexpander.models.registry import build_reconstructor
-from sceneexpander.synthetic.views import make_views
-
-TINY = MiniConfig(
-    work_px=64,
-    width=16,
-    attention_heads=1,
-    stem_widths=(8, 16, 16),
-    dpt_widths=(8, 8, 8, 8),
-    features=8,
-    head_width=8,
-    camera_blocks=1,
-    camera_gain=1.0,
-)
-
-
-def scene(views: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, Priors]:
-    """Random pictures and plausible priors; the first camera is the world."""
-    draw = torch.Generator().manual_seed(seed)
-    quat = torch.nn.functional.normalize(
-        torch.tensor([1.0, 0, 0, 0]) + 0.05 * torch.randn(views, 4, generator=draw), dim=-1
-    )
-    poses = rigid_from_parts(rotation_from_quat_wxyz(quat), 0.2 * torch.randn(views, 3, generator=draw))
-    poses[0] = torch.eye(4)
-    intrinsics = torch.tensor([[0.9 * width, 0, width / 2 + 1], [0, 0.9 * width, height / 2 - 1], [0, 0, 1]])
-    evidence = torch.rand(views, len(EVIDENCE_CHANNELS), height, width, generator=draw)
-    evidence[:, 0] = (evidence[:, 0] > 0.6).float()
-    coarse = 1 + 2 * torch.rand(views, 1, height // 14, width // 14, generator=draw)
-    depth = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bilinear")[:, 0]
-    priors = Priors(world_from_cam=poses, intrinsics_px=intrinsics.repeat(views, 1, 1), depth=depth, evidence=evidence)
-    return torch.rand(views, 3, height, width, generator=draw), priors
-
-
-def make_model(*, perturbed: bool = False, config: MiniConfig = TINY) -> Mini:
-    """A new model with fixed initial values; ``perturbed``: with last layers that are not zero."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        model = Mini(config)
-        if perturbed:
-            with torch.no_grad():
-                for parameter in model.parameters():
-                    parameter.add_(0.02 * torch.randn_like(parameter))
-    return model
+from sceneexpander.training.measure import geometry_row
+from sceneexpander.training.sample import Sample
+from sceneexpander.training.scores import scene_samples
+from sceneexpander.training.trainer import LossWeights, TrainConfig, Trainer
+from tests.worlds.small_mini import TINY, make_model, scene
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +246,7 @@ def test_a_guess_gives_way_to_a_view_that_sees_the_place() -> None:
     sure = torch.full((40, 40), 2.0)
     for guess, expected in ((1.0, 1.0), (2.0, 1.0), (3.0, 0.0)):  # in front of the surface, on it, hidden behind it
         depth = torch.stack([torch.full((40, 40), guess), sure])
-        covered = covered_by_others(depth, confident, poses, intrinsics, posed, most_views=4)
+        covered = covered_by_others(depth, confident, Cameras(poses, intrinsics, 40, 40), posed, most_views=4)
         assert covered[0].unique().tolist() == [expected]
         assert covered[1].unique().tolist() == [0.0]
 
@@ -299,14 +259,14 @@ def test_cross_view_channels_tell_front_from_behind() -> None:
     posed = torch.ones(2, dtype=torch.bool)
     confident = torch.ones(2, 40, 40)
     log_depth = torch.log(torch.stack([torch.full((40, 40), 3.0), torch.full((40, 40), 2.0)]))
-    geometry = PairGeometry(log_depth, confident, poses, intrinsics, posed)
+    geometry = PairGeometry(log_depth, confident, Cameras(poses, intrinsics, 40, 40), posed)
     channels = geometry.compare(images, (0, 1), most_views=4)
     behind, in_front = channels[:, 2, 20, 20], channels[:, 3, 20, 20]
     ratio = torch.log(torch.tensor(1.5))
     torch.testing.assert_close(behind, torch.stack([ratio, torch.zeros(())]), atol=1e-5, rtol=0)
     torch.testing.assert_close(in_front, torch.stack([torch.zeros(()), ratio]), atol=1e-5, rtol=0)
     posed[1] = False
-    unposed = PairGeometry(log_depth, confident, poses, intrinsics, posed)
+    unposed = PairGeometry(log_depth, confident, Cameras(poses, intrinsics, 40, 40), posed)
     assert unposed.compare(images, (0, 1), most_views=4).abs().max() == 0
 
 
@@ -327,7 +287,7 @@ def test_what_is_measured_once_serves_every_subset(views: tuple[int, ...]) -> No
 def test_splatted_depth_keeps_the_nearest_point() -> None:
     intrinsics = torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]])
     points = torch.tensor([[0.01, 0.01, 4.0], [0.01, 0.01, 2.0], [0.0, 0.0, -1.0]])
-    found = splat_log_depth(points, rigid_inverse(torch.eye(4)), intrinsics, 10, 10)
+    found = splat_log_depth(points, Cameras(torch.eye(4)[None], intrinsics[None], 10, 10))
     assert int(found.isfinite().sum()) == 1
     assert found[5, 5].exp().item() == pytest.approx(2.0)
 
@@ -505,8 +465,8 @@ def test_the_first_view_of_an_augmented_sample_has_a_pose(held_out: list[Sample]
 
 
 def test_kept_samples_of_a_scored_scene_are_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sceneexpander.models.mini.training.scores.HEIGHT", 112)
-    monkeypatch.setattr("sceneexpander.models.mini.training.scores.WIDTH", 168)
+    monkeypatch.setattr("sceneexpander.training.scores.HEIGHT", 112)
+    monkeypatch.setattr("sceneexpander.training.scores.WIDTH", 168)
     first = scene_samples(5, noisy=True, front_end=False, kept=tmp_path)
     assert first.own_cameras is None
     assert sorted(path.name for path in tmp_path.iterdir()) == ["5_noisy.safetensors", "5_true.safetensors"]
@@ -514,7 +474,7 @@ def test_kept_samples_of_a_scored_scene_are_used_again(tmp_path: Path, monkeypat
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("made again")
 
-    monkeypatch.setattr("sceneexpander.models.mini.training.scores.sample_of_scene", refuse)
+    monkeypatch.setattr("sceneexpander.training.scores.sample_of_scene", refuse)
     again = scene_samples(5, noisy=True, front_end=False, kept=tmp_path)
     assert torch.equal(again.true_cameras.prior_log_depth, first.true_cameras.prior_log_depth)
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from sceneexpander.geometry.camera import intrinsics_from_parts, pixel_centres, unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, rgb_from_sh
 from sceneexpander.geometry.normals import normals_from_depth
 from sceneexpander.geometry.rigid import look_at, rotation_from_quat_wxyz
@@ -68,8 +69,7 @@ def frontal(
         images=images,
         depth=maps,
         depth_conf=torch.full_like(maps, conf),
-        world_from_cam=poses,
-        intrinsics_px=intrinsics,
+        cameras=Cameras(poses, intrinsics, *images.shape[2:]),
         rule=rule or SplatRule(),
     )
     return gaussians, maps
@@ -82,9 +82,9 @@ def test_a_plane_seen_from_two_cameras_renders_back_to_both_pictures() -> None:
     images, depth, poses, intrinsics = slanted_plane()
     conf = torch.full_like(depth, 50.0)
     gaussians = pixel_aligned(
-        images=images, depth=depth, depth_conf=conf, world_from_cam=poses, intrinsics_px=intrinsics
+        images=images, depth=depth, depth_conf=conf, cameras=Cameras(poses, intrinsics, *images.shape[2:])
     )
-    rendered = render(gaussians, poses, intrinsics, HEIGHT, WIDTH).rgb
+    rendered = render(gaussians, Cameras(poses, intrinsics, HEIGHT, WIDTH)).rgb
     # On a slanted surface the nearer neighbours cover part of every pixel, which displaces the picture by about half a pixel and
     # blurs it by one: 29 dB for this pattern. A further pixel off or Gaussians of 1 px cost 2 dB and more. The bar lies between.
     bar = 28.5
@@ -93,9 +93,9 @@ def test_a_plane_seen_from_two_cameras_renders_back_to_both_pictures() -> None:
     shifted[:, :2, 2] += 1
     for camera, rule in ((shifted, SplatRule()), (intrinsics, SplatRule(std_px=1.0))):
         worse = pixel_aligned(
-            images=images, depth=depth, depth_conf=conf, world_from_cam=poses, intrinsics_px=camera, rule=rule
+            images=images, depth=depth, depth_conf=conf, cameras=Cameras(poses, camera, *images.shape[2:]), rule=rule
         )
-        assert psnr_db(render(worse, poses, intrinsics, HEIGHT, WIDTH).rgb, images) < bar - 1
+        assert psnr_db(render(worse, Cameras(poses, intrinsics, HEIGHT, WIDTH)).rgb, images) < bar - 1
 
 
 def test_a_surface_has_no_holes_even_from_somewhat_nearer() -> None:
@@ -111,7 +111,7 @@ def test_a_surface_has_no_holes_even_from_somewhat_nearer() -> None:
         # opacity, less a sixth: 1 - (1 - 0.47)^4 = 0.92.
         (nearer, 0.9),
     ):
-        alpha = render(frontal(tilt_deg=40)[0], camera, pinhole(1), HEIGHT, WIDTH).alpha
+        alpha = render(frontal(tilt_deg=40)[0], Cameras(camera, pinhole(1), HEIGHT, WIDTH)).alpha
         assert alpha[inner].min() > least
 
 
@@ -125,12 +125,12 @@ def test_a_surface_stays_closed_at_every_size(times: float) -> None:
     for rule, least in ((SplatRule(), 0.9), (SplatRule(std_px=0.1), 0.6)):
         gaussians, _ = frontal(rule=rule)
         assert gaussians.antialiased
-        assert render(gaussians, torch.eye(4)[None], lens, height, width).alpha[inner].min() > least
+        assert render(gaussians, Cameras(torch.eye(4)[None], lens, height, width)).alpha[inner].min() > least
     # Without the limit, and drawn as it used to be, the same rule falls apart as soon as the picture is larger.
     gaussians, _ = frontal(rule=SplatRule(std_px=0.1))
     narrow = replace(gaussians, scales=gaussians.scales * 0.2, antialiased=False)
     if times >= 4:
-        assert render(narrow, torch.eye(4)[None], lens, height, width).alpha[inner].min() < 0.1
+        assert render(narrow, Cameras(torch.eye(4)[None], lens, height, width)).alpha[inner].min() < 0.1
 
 
 @pytest.mark.parametrize("depth", [0.5, 2.0])
@@ -173,8 +173,7 @@ def test_positions_colours_and_provenance_are_those_of_the_pixels() -> None:
         images=images,
         depth=depth,
         depth_conf=torch.full_like(depth, 2.0),
-        world_from_cam=poses,
-        intrinsics_px=intrinsics,
+        cameras=Cameras(poses, intrinsics, *images.shape[2:]),
         generated=generated,
     )
     pixels = HEIGHT * WIDTH
@@ -202,8 +201,7 @@ def test_depth_is_differentiable_and_cameras_are_not() -> None:
         images=images,
         depth=depth,
         depth_conf=torch.full_like(depth, 2.0),
-        world_from_cam=poses,
-        intrinsics_px=intrinsics,
+        cameras=Cameras(poses, intrinsics, *images.shape[2:]),
     )
     (gaussians.means.square().sum() + gaussians.scales.sum()).backward()
     assert depth.grad is not None
@@ -226,4 +224,4 @@ def test_maps_of_another_size_are_named(name: str) -> None:
     maps = {"depth": depth, "depth_conf": torch.full_like(depth, 2.0)}
     maps[name] = maps[name][:, :-1]
     with pytest.raises(ValueError, match=rf"{name} has shape \(2, 47, 64\)"):
-        pixel_aligned(images=images, world_from_cam=poses, intrinsics_px=intrinsics, **maps)
+        pixel_aligned(images=images, cameras=Cameras(poses, intrinsics, *images.shape[2:]), **maps)

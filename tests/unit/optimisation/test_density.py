@@ -8,32 +8,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
-from sceneexpander.optimisation.config import DensityConfig, RatesConfig
-from sceneexpander.optimisation.density import CloneAndSplit, Relocation, Schedule, Seen, shared_appearance
-from sceneexpander.optimisation.splats import Splats, thinned
+from sceneexpander.optimisation.config import DensityConfig
+from sceneexpander.optimisation.density import CloneAndSplit, Relocation, Schedule, shared_appearance
+from sceneexpander.optimisation.splats import thinned
 from sceneexpander.splatting import render
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
-
-
-def splats_of(gaussians: Gaussians, sh_degree: int = 1) -> Splats:
-    return Splats.of(gaussians, RatesConfig(), extent=1.0, sh_degree=sh_degree)
-
-
-def moved(splats: Splats) -> None:
-    """One optimiser step on an arbitrary loss, so that every row has momentum of its own."""
-    total = torch.zeros(())
-    for name in splats.optimisers:
-        value = splats.params[name]
-        total = total + (value * torch.arange(1, len(value) + 1).reshape(-1, *[1] * (value.ndim - 1))).sum()
-    total.backward()
-    splats.step()
-
-
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(3)
+from tests.worlds.few_splats import CONFIG, five, generator, moved, seen, splats_of
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 
 def test_there_and_back() -> None:
@@ -73,28 +56,6 @@ def test_rows_keep_their_momentum_and_origin_and_new_ones_start_at_rest() -> Non
     assert not splats.params["generated"].requires_grad
     moved(splats)
     assert len(splats) == 3
-
-
-def seen(pull: Tensor, visible: Tensor | None = None) -> Seen:
-    """Pulls given in half images; the image is 20 x 20 pixels."""
-    gradient = torch.stack([pull / 10, torch.zeros_like(pull)], -1)
-    radius = torch.ones_like(pull) if visible is None else visible
-    return Seen(centre_gradient=gradient, radius_px=radius, height=20, width=20)
-
-
-CONFIG = DensityConfig(start=0.0, stop=1.0, every=1, gradient=0.1, split_above=0.1, min_opacity=0.1)
-
-
-def five() -> Gaussians:
-    """Pulled small, pulled large, calm, nearly transparent, and pulled small but never seen."""
-    gaussians = random_gaussians(5)
-    return replace(
-        gaussians,
-        scales=torch.tensor([0.05, 0.5, 0.05, 0.05, 0.05])[:, None].expand(5, 3).clone(),
-        opacities=torch.tensor([0.8, 0.8, 0.8, 0.05, 0.8]),
-        source_view=torch.arange(5),
-        generated=torch.tensor([True, True, False, False, False]),
-    )
 
 
 def test_small_ones_are_cloned_large_ones_split_transparent_ones_go() -> None:
@@ -182,7 +143,7 @@ def test_the_dead_move_to_the_living_and_the_picture_stays() -> None:
     assert result.generated.all(), "what moved shows what the living one showed"
     torch.testing.assert_close(result.means, start.means[:1].expand(4, 3))
     camera = (cameras(1), intrinsics(1, 40, 60), 40, 60)
-    before, after = render(start.select(torch.tensor([0])), *camera), render(result, *camera)
+    before, after = render(start.select(torch.tensor([0])), Cameras(*camera)), render(result, Cameras(*camera))
     assert float((before.rgb - after.rgb).abs().max()) < 0.02 < 0.1 * float(before.rgb.max())
 
 

@@ -10,7 +10,7 @@ import torch
 from sceneexpander.errors import UserError
 from sceneexpander.optimisation.config import DensityConfig
 from sceneexpander.optimisation.density import CloneAndSplit
-from tests.unit.optimisation.test_density import CONFIG, five, generator, moved, seen, splats_of
+from tests.worlds.few_splats import CONFIG, five, generator, moved, seen, splats_of
 
 
 def test_without_gsplat_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,20 +18,12 @@ from sceneexpander.geometry.gaussians import ROWS
 from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
 from sceneexpander.optimisation.config import DensityConfig, OptimiseConfig, RatesConfig
 from sceneexpander.optimisation.optimise import _run_key, optimise, photometric_loss, scene_extent, unusable
-from tests.unit.evaluation.made import made_reconstruction, own_pictures
+from tests.worlds.spoiled import TRUTH, VIEWS, spoiled
+from tests.worlds.wall import own_pictures
 
-TRUTH = made_reconstruction()
-VIEWS = own_pictures(TRUTH)
 SHORT = OptimiseConfig(
     steps=12, sh_degree=1, checkpoint_every=4, density=DensityConfig(start=0.0, stop=1.0, every=3, gradient=1e-6)
 )
-
-
-def spoiled() -> Reconstruction:
-    """Grey Gaussians, too small, somewhat out of place."""
-    gaussians, generator = TRUTH.gaussians, torch.Generator().manual_seed(0)
-    means = gaussians.means + 0.02 * torch.randn(gaussians.means.shape, generator=generator)
-    return replace(TRUTH, gaussians=replace(gaussians, means=means, scales=0.6 * gaussians.scales, sh=0 * gaussians.sh))
 
 
 def psnr(reconstruction: Reconstruction, views: ViewSet = VIEWS) -> float:

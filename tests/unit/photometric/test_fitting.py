@@ -10,8 +10,8 @@ import torch
 from sceneexpander.insertion.contradiction import pixel_trust
 from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.fitting import fit_to_views
-from tests.unit.evaluation.made import own_pictures
-from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
+from tests.worlds.spoiled import TRUTH, VIEWS, spoiled
+from tests.worlds.wall import own_pictures
 
 
 @pytest.mark.parametrize("doubt", [True, False])

@@ -12,13 +12,14 @@ from sceneexpander.artifacts.views import to_bytes
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.image import psnr
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.sampling import BAND_LIMIT_PX, finest_pixel
 from sceneexpander.optimisation.optimise import photometric_loss
 from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.refine import refine
 from sceneexpander.splatting import render
-from tests.unit.optimisation.test_optimise import TRUTH, VIEWS, spoiled
+from tests.worlds.spoiled import TRUTH, VIEWS, spoiled
 
 CONFIG = RefineConfig(visits=20, colours=0.1)  # fast colours: the start is grey
 IMAGES = VIEWS.images
@@ -27,7 +28,7 @@ IMAGES = VIEWS.images
 def shown(reconstruction: object, view: int) -> float:
     """PSNR of one view's picture."""
     gaussians, one = reconstruction.gaussians, slice(view, view + 1)  # type: ignore[attr-defined]
-    seen = render(gaussians, TRUTH.world_from_cam[one], TRUTH.intrinsics_px[one], *IMAGES.shape[2:])
+    seen = render(gaussians, Cameras(TRUTH.world_from_cam[one], TRUTH.intrinsics_px[one], *IMAGES.shape[2:]))
     return psnr(seen.rgb[0], IMAGES[view])
 
 
@@ -115,7 +116,7 @@ def test_dark_surfaces_become_solid_and_not_transparent() -> None:
     result, report = refine(faint, 0 * IMAGES, replace(CONFIG, visits=30), seed=0)
     assert report is not None
     assert report.accepted
-    seen = render(result.gaussians, TRUTH.world_from_cam, TRUTH.intrinsics_px, *IMAGES.shape[2:])
+    seen = render(result.gaussians, Cameras(TRUTH.world_from_cam, TRUTH.intrinsics_px, *IMAGES.shape[2:]))
     # Against a black background a picture without anything in it would be as good.
     assert float((seen.alpha[:, 3:-3, 3:-3] > 0.9).double().mean()) > 0.99
     assert float(seen.rgb.mean()) < 0.05
@@ -125,12 +126,11 @@ def test_nothing_gets_narrower_than_the_finest_view_resolves() -> None:
     dust = replace(TRUTH, gaussians=replace(TRUTH.gaussians, scales=0.05 * TRUTH.gaussians.scales))
     photos = [to_bytes(functional.interpolate(image[None], scale_factor=2)[0]) for image in IMAGES]
     height, width = IMAGES.shape[2:]
-    lens = resize_intrinsics(TRUTH.intrinsics_px, 2, 2)
-    for given, lenses, size in ((None, TRUTH.intrinsics_px, (height, width)), (photos, lens, (2 * height, 2 * width))):
+    for given, cameras in ((None, TRUTH.cameras), (photos, TRUTH.cameras.resized(2 * height, 2 * width))):
         result, report = refine(dust, IMAGES, replace(CONFIG, visits=12, colours=0.01), photos=given, seed=0)
         assert report is not None
         assert report.accepted
-        pixel = finest_pixel(dust.gaussians.means, TRUTH.world_from_cam, lenses, [size] * len(IMAGES))
+        pixel = finest_pixel(dust.gaussians.means, [cameras])
         assert bool((result.gaussians.scales >= 0.999 * BAND_LIMIT_PX * pixel[:, None]).all())
         assert result.gaussians.antialiased
 
@@ -145,7 +145,7 @@ def test_what_only_the_photos_show_is_fitted() -> None:
     lens = resize_intrinsics(TRUTH.intrinsics_px, 2, 2)
 
     def own(gaussians: Gaussians) -> float:
-        seen = render(gaussians, TRUTH.world_from_cam[:1], lens[:1], 2 * height, 2 * width)
+        seen = render(gaussians, Cameras(TRUTH.world_from_cam[:1], lens[:1], 2 * height, 2 * width))
         return psnr(seen.rgb[0], fine[0])
 
     without, _ = refine(spoiled(), stored, CONFIG, seed=0)

@@ -9,57 +9,17 @@ from typing import Any
 import pytest
 import torch
 
-from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.errors import UserError
-from sceneexpander.geometry.camera import camera_vector_from_pose
-from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.rendering.config import EyeKey, RenderConfig, ViewKey
 from sceneexpander.rendering.produce import produce_renders
 from sceneexpander.rendering.tour import plan_tour
 from sceneexpander.splatting.spz import read_spz
+from tests.worlds.row_of_views import reconstruction
 
-HEIGHT, WIDTH = 21, 28
 CONFIG = RenderConfig(frames=9, fps=6, stills=3)
-
-
-def reconstruction(method: str, centres: list[float], *, scale: float = 1.0, generated: int = 0) -> Reconstruction:
-    """Cameras on a line that look along +z at a wall of Gaussians; the last ``generated`` views are generated."""
-    views = len(centres)
-    poses = torch.eye(4).repeat(views, 1, 1)
-    poses[:, 0, 3] = scale * torch.tensor(centres)
-    intrinsics = torch.tensor([[25.0, 0, WIDTH / 2], [0, 25.0, HEIGHT / 2], [0, 0, 1]]).repeat(views, 1, 1)
-    is_generated = torch.arange(views) >= views - generated
-    x, y = torch.meshgrid(torch.linspace(-2, 3, 40), torch.linspace(-1, 1, 16), indexing="xy")
-    means = scale * torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), 2.0)], -1)
-    count = len(means)
-    gaussians = Gaussians(
-        means=means,
-        quat_wxyz=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        scales=torch.full((count, 3), 0.08 * scale),
-        opacities=torch.full((count,), 0.9),
-        sh=torch.zeros(count, 1, 3),
-        source_view=torch.zeros(count, dtype=torch.int64),
-        generated=means[:, 0] > 1.5 * scale,
-    )
-    return Reconstruction(
-        method=method,
-        model="mini",
-        weights_sha256="0" * 64,
-        view_ids=tuple(f"v{i}" for i in range(views)),
-        generated=is_generated,
-        posed=torch.ones(views, dtype=torch.bool),
-        camera_vector=camera_vector_from_pose(poses, intrinsics, HEIGHT, WIDTH),
-        world_from_cam=poses,
-        intrinsics_px=intrinsics,
-        depth=torch.full((views, HEIGHT, WIDTH), 2.0 * scale),
-        depth_conf=torch.full((views, HEIGHT, WIDTH), 2.0),
-        normals=torch.tensor([0.0, 0, -1]).expand(views, HEIGHT, WIDTH, 3).clone(),
-        normals_conf=torch.full((views, HEIGHT, WIDTH), 2.0),
-        gaussians=gaussians,
-    )
 
 
 BACKBONE = reconstruction("backbone", [0.0, 0.4, 0.2, 1.5], generated=1)
@@ -67,11 +27,11 @@ BACKBONE = reconstruction("backbone", [0.0, 0.4, 0.2, 1.5], generated=1)
 
 def test_it_starts_and_ends_at_a_captured_camera_and_visits_the_inserted_one() -> None:
     tour = plan_tour(BACKBONE, BACKBONE, CONFIG)
-    x = tour.world_from_cam[:, 0, 3]
+    x = tour.cameras.world_from_cam[:, 0, 3]
     # Shortest way to the inserted camera at 1.5: 0.0, 0.2, 0.4, 1.5 and back.
     torch.testing.assert_close(x[[0, -1]], torch.zeros(2))
     assert tour.inserted_frame == int(x.argmax())
-    torch.testing.assert_close(tour.world_from_cam[tour.inserted_frame], BACKBONE.world_from_cam[3])
+    torch.testing.assert_close(tour.cameras.world_from_cam[tour.inserted_frame], BACKBONE.world_from_cam[3])
     torch.testing.assert_close(x, x.flip(0), atol=1e-5, rtol=0)
     assert tour.inserted_camera == "backbone"
 
@@ -81,33 +41,35 @@ def test_before_the_insertion_the_camera_comes_from_the_reference_in_this_gauge(
     tour = plan_tour(captured, BACKBONE, CONFIG)
     assert tour.inserted_camera == "backbone"
     # The reference's camera at 1.5 stands at 4.5 where every length is three times as long.
-    torch.testing.assert_close(tour.world_from_cam[tour.inserted_frame, 0, 3], torch.tensor(4.5), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        tour.cameras.world_from_cam[tour.inserted_frame, 0, 3], torch.tensor(4.5), atol=1e-3, rtol=0
+    )
 
 
 def test_views_without_a_camera_are_not_visited() -> None:
     lost = replace(BACKBONE, posed=torch.tensor([True, False, True, True]))
     tour = plan_tour(lost, lost, CONFIG)
-    stops = (tour.world_from_cam[:, 0, 3, None] - torch.tensor([0.0, 0.2, 1.5])).abs().min(0).values
+    stops = (tour.cameras.world_from_cam[:, 0, 3, None] - torch.tensor([0.0, 0.2, 1.5])).abs().min(0).values
     torch.testing.assert_close(stops, torch.zeros(3), atol=1e-5, rtol=0)
 
 
 def test_the_orbit_starts_at_the_inserted_camera_and_keeps_what_it_looks_at() -> None:
     tour = plan_tour(BACKBONE, BACKBONE, replace(CONFIG, path="orbit", orbit_deg=40.0))
-    torch.testing.assert_close(tour.world_from_cam[0], BACKBONE.world_from_cam[3])
+    torch.testing.assert_close(tour.cameras.world_from_cam[0], BACKBONE.world_from_cam[3])
     assert tour.inserted_frame == 0
-    eye, ahead = tour.world_from_cam[:, :3, 3], tour.world_from_cam[:, :3, 2]
+    eye, ahead = tour.cameras.world_from_cam[:, :3, 3], tour.cameras.world_from_cam[:, :3, 2]
     # It looks along +z from x = 1.5 at a wall 2 away.
     torch.testing.assert_close(eye + 2 * ahead, torch.tensor([1.5, 0.0, 2.0]).expand(9, 3), atol=1e-5, rtol=0)
-    turned = rotation_angle_deg(torch.eye(3).expand(9, 3, 3), tour.world_from_cam[:, :3, :3])
+    turned = rotation_angle_deg(torch.eye(3).expand(9, 3, 3), tour.cameras.world_from_cam[:, :3, :3])
     assert 19 < float(turned.max()) <= 20.01
     torch.testing.assert_close(eye[:, 1], torch.zeros(9), atol=1e-6, rtol=0)
 
 
 def test_the_spiral_stays_within_its_radius() -> None:
     tour = plan_tour(BACKBONE, BACKBONE, replace(CONFIG, frames=60, path="spiral", spiral_radius=0.2))
-    away = (tour.world_from_cam[:, :3, 3] - BACKBONE.world_from_cam[3, :3, 3]).norm(dim=-1)
+    away = (tour.cameras.world_from_cam[:, :3, 3] - BACKBONE.world_from_cam[3, :3, 3]).norm(dim=-1)
     assert 0.3 < float(away.max()) < 1.2 * 0.2 * 2
-    torch.testing.assert_close(tour.world_from_cam[[0, -1]], BACKBONE.world_from_cam[[3, 3]], atol=1e-5, rtol=0)
+    torch.testing.assert_close(tour.cameras.world_from_cam[[0, -1]], BACKBONE.world_from_cam[[3, 3]], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("path", ["orbit", "spiral"])
@@ -115,9 +77,9 @@ def test_other_paths_are_the_same_in_another_gauge(path: str) -> None:
     captured = reconstruction("captured", [0.0, 0.4, 0.2], scale=3.0)
     config = replace(CONFIG, path=path)  # type: ignore[arg-type]
     ours, theirs = plan_tour(captured, BACKBONE, config), plan_tour(BACKBONE, BACKBONE, config)
-    moved = theirs.world_from_cam.clone()
+    moved = theirs.cameras.world_from_cam.clone()
     moved[:, :3, 3] *= 3
-    torch.testing.assert_close(ours.world_from_cam, moved, atol=1e-3, rtol=0)
+    torch.testing.assert_close(ours.cameras.world_from_cam, moved, atol=1e-3, rtol=0)
     assert ours.inserted_camera == "backbone"
 
 
@@ -125,14 +87,14 @@ def test_key_frames_are_passed_in_order_each_method_in_its_own_frame() -> None:
     keys = (ViewKey(view="v1"), EyeKey(eye=(0.0, -1.0, 0.5), target=(0.3, 0.0, 2.0)), ViewKey(view="v3"))
     config = replace(CONFIG, path="keyframes", keyframes=keys, frames=21)
     tour = plan_tour(BACKBONE, BACKBONE, config)
-    torch.testing.assert_close(tour.world_from_cam[0], BACKBONE.world_from_cam[1])
-    torch.testing.assert_close(tour.world_from_cam[-1], BACKBONE.world_from_cam[3])
-    nearest = (tour.world_from_cam[:, :3, 3] - torch.tensor([0.0, -1.0, 0.5])).norm(dim=-1)
+    torch.testing.assert_close(tour.cameras.world_from_cam[0], BACKBONE.world_from_cam[1])
+    torch.testing.assert_close(tour.cameras.world_from_cam[-1], BACKBONE.world_from_cam[3])
+    nearest = (tour.cameras.world_from_cam[:, :3, 3] - torch.tensor([0.0, -1.0, 0.5])).norm(dim=-1)
     assert float(nearest.min()) < 1e-5
-    ahead = tour.world_from_cam[int(nearest.argmin()), :3, 2]
+    ahead = tour.cameras.world_from_cam[int(nearest.argmin()), :3, 2]
     torch.testing.assert_close(ahead, torch.nn.functional.normalize(torch.tensor([0.3, 1.0, 1.5]), dim=0))
     captured = plan_tour(reconstruction("captured", [0.0, 0.4, 0.2], scale=3.0), BACKBONE, config)
-    nearest = (captured.world_from_cam[:, :3, 3] - torch.tensor([0.0, -3.0, 1.5])).norm(dim=-1)
+    nearest = (captured.cameras.world_from_cam[:, :3, 3] - torch.tensor([0.0, -3.0, 1.5])).norm(dim=-1)
     assert float(nearest.min()) < 1e-3
 
 

@@ -9,46 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
+from sceneexpander.artifacts.cameras import CameraReport
 from sceneexpander.artifacts.metrics import ViewMetrics
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.report import SceneSource, collect_scene, write_page
 from sceneexpander.report.cameras import camera_lines, cameras_shown, gathered_cameras
 from sceneexpander.tracking import scene_runs
-from tests.unit.report.test_page import gathered, row, source  # noqa: F401 - fixtures
-
-FINE = ViewCamera(
-    view_id="v0",
-    name="a.jpg",
-    generated=False,
-    posed=True,
-    rough=False,
-    reason="",
-    warnings=(),
-    focal_ratio=0.75,
-    focal_source="refined",
-    distortion=(0.0, 0.0),
-    inliers=120,
-    error_px=0.5,
-)
-LOST = replace(FINE, view_id="v1", name="b <1>.jpg", posed=False, reason="its matches agree with no camera", inliers=0)
-NEW = replace(FINE, view_id="v2", name="new.png", generated=True, rough=True, reason="few points")
-PHOTOS = CameraReport(views=(FINE, LOST), notes=("two cameras took the photos",))
-ALL = CameraReport(views=(FINE, LOST, NEW), notes=())
-
-
-def saved(folder: Path, report: CameraReport) -> Path:
-    report.save(folder)
-    return folder
-
-
-def with_cameras(source: SceneSource, folder: Path) -> SceneSource:  # noqa: F811 - not the fixture
-    rounds = [replace(item, cameras=saved(folder / "all", ALL)) for item in source.rounds]
-    return replace(source, cameras=saved(folder / "photos", PHOTOS), rounds=rounds)
+from tests.worlds.reports import row
+from tests.worlds.reports_with_cameras import ALL, FINE, LOST, NEW, PHOTOS, saved, with_cameras
 
 
 @pytest.fixture
-def outputs(source: SceneSource, tmp_path: Path) -> Path:  # noqa: F811 - the fixture
+def outputs(source: SceneSource, tmp_path: Path) -> Path:
     pages = tmp_path / "outputs" / "pages" / "room"
     pages.mkdir(parents=True)
     collect_scene(with_cameras(source, tmp_path), pages)
@@ -76,7 +48,7 @@ def test_every_view_has_a_card_with_its_state_and_its_reason(outputs: Path) -> N
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_lost_view_is_said_once(source: SceneSource, tmp_path: Path, known: bool) -> None:  # noqa: F811 - the fixture
+def test_a_lost_view_is_said_once(source: SceneSource, tmp_path: Path, known: bool) -> None:
     """The method ``backbone`` has no camera for v2: what the cameras' own report says is not repeated for every method."""
     told = with_cameras(source, tmp_path)
     (tmp_path / "room").mkdir()
@@ -142,14 +114,14 @@ def test_runs_hold_what_is_not_as_it_should_be(outputs: Path) -> None:
         assert problem in adapted.tags["mlflow.note.content"]
 
 
-def test_runs_without_a_report_have_no_such_tags(gathered: Path) -> None:  # noqa: F811 - the fixture
+def test_runs_without_a_report_have_no_such_tags(gathered: Path) -> None:
     for run in scene_runs(gathered, commit="abc"):
         assert not [tag for tag in run.tags if tag.startswith("cameras")]
         assert "cameras.txt" not in run.artefacts
 
 
 def test_means_say_how_many_views_they_are_over_and_lost_views_stand_apart(
-    source: SceneSource,  # noqa: F811 - the fixture
+    source: SceneSource,
     tmp_path: Path,
 ) -> None:
     def view(name: str, *, posed: bool, psnr: float) -> ViewMetrics:

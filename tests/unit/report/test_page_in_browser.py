@@ -9,8 +9,7 @@ import pytest
 
 from sceneexpander.report import SceneSource, collect_scene, write_page
 from tests.support.browser import Page, browser_page
-from tests.unit.report.test_cameras import with_cameras
-from tests.unit.report.test_page import source  # noqa: F401 - fixture
+from tests.worlds.reports_with_cameras import with_cameras
 
 WIDE, NARROW = 1280, 390
 # Elements that stick out, or that scroll within themselves.
@@ -24,7 +23,7 @@ SCROLLING = """[...document.querySelectorAll('main *')].filter(e =>
 
 
 @pytest.fixture(scope="module")
-def html(source: SceneSource, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811 - the fixture
+def html(source: SceneSource, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("shown")
     (folder / "room").mkdir()
     collect_scene(with_cameras(source, folder), folder / "room")

@@ -14,9 +14,8 @@ from sceneexpander.artifacts.page import RoundPage, ScenePage, StageRun
 from sceneexpander.artifacts.proposals import Proposal, Proposals
 from sceneexpander.report import SceneSource, collect_scene, write_page
 from sceneexpander.report.rounds import drift_chart, rounds_shown
-from tests.unit.report.test_page import row, source
+from tests.worlds.reports import row
 
-__all__ = ["source"]
 NAMES = {"v0": "a.jpg", "v1": "b.jpg", "n1": "inserted view of round 1", "n2": "inserted view of round 2"}
 
 

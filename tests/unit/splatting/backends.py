@@ -8,10 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.splatting import RasterSettings, Render, render
 from sceneexpander.splatting.kernel_backend import load_kernel
-from tests.unit.splatting.scenes import intrinsics
+from tests.worlds.random_gaussians import intrinsics
 
 H, W = 43, 57  # no multiples of the tile size
 needs_kernel = pytest.mark.skipif(load_kernel() is None, reason="no compiled kernel (no compiler at install)")
@@ -33,7 +34,7 @@ def assert_same_pictures(a: Render, b: Render, tolerance: float) -> None:
 def gradients(gaussians: Gaussians, world_from_cam: Tensor, chosen: RasterSettings) -> dict[str, Tensor]:
     leaves = {name: getattr(gaussians, name).detach().clone().requires_grad_() for name in DIFFERENTIABLE}
     poses = world_from_cam.clone().requires_grad_()
-    picture = render(replace(gaussians, **leaves), poses, intrinsics(len(poses), H, W), H, W, settings=chosen)
+    picture = render(replace(gaussians, **leaves), Cameras(poses, intrinsics(len(poses), H, W), H, W), settings=chosen)
     weights = torch.linspace(-1, 2, W)
     loss = (picture.rgb**2 * weights).sum() + (picture.alpha * weights).sum() + (picture.generated * weights).sum()
     # Expected depth of barely covered pixels is a quotient of roundings: only where there is something.

@@ -8,8 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import RasterSettings, rasterise, render
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 FIELDS = ("means", "quat_wxyz", "scales", "opacities", "sh")
 
@@ -22,48 +23,48 @@ def test_non_finite_gaussians_are_named(field: str, bad: float) -> None:
     value[7].view(-1)[-1] = bad
     name = "colours" if field == "sh" else field
     with pytest.raises(ValueError, match=f"{name} row 7 is not finite"):
-        render(replace(scene, **{field: value}), cameras(1), intrinsics(1, 8, 8), 8, 8)
+        render(replace(scene, **{field: value}), Cameras(cameras(1), intrinsics(1, 8, 8), 8, 8))
 
 
 def test_non_finite_cameras_are_named() -> None:
     poses, k = cameras(2), intrinsics(2, 8, 8).clone()
     poses[1, 0, 3] = math.nan
     with pytest.raises(ValueError, match="world_from_cam row 1 is not finite"):
-        render(random_gaussians(3), poses, k, 8, 8)
+        render(random_gaussians(3), Cameras(poses, k, 8, 8))
     k[1, 0, 0] = math.nan
     with pytest.raises(ValueError, match="intrinsics_px row 1 is not finite"):
-        render(random_gaussians(3), cameras(2), k, 8, 8)
+        render(random_gaussians(3), Cameras(cameras(2), k, 8, 8))
 
 
 def test_singular_and_skewed_intrinsics_are_refused() -> None:
     k = intrinsics(2, 8, 8).clone()
     k[1, 1, 1] = 0
     with pytest.raises(ValueError, match="intrinsics_px row 1 is singular"):
-        render(random_gaussians(3), cameras(2), k, 8, 8)
+        render(random_gaussians(3), Cameras(cameras(2), k, 8, 8))
     k = intrinsics(2, 8, 8).clone()
     k[0, 0, 1] = 0.5
     with pytest.raises(ValueError, match="intrinsics_px row 0 is not"):
-        render(random_gaussians(3), cameras(2), k, 8, 8)
+        render(random_gaussians(3), Cameras(cameras(2), k, 8, 8))
 
 
 @pytest.mark.parametrize(("height", "width"), [(0, 8), (8, 0), (8, -1), (8, 40000)])
 def test_impossible_image_sizes_are_refused(height: int, width: int) -> None:
     with pytest.raises(ValueError, match=f"image size {height} x {width}"):
-        render(random_gaussians(3), cameras(1), intrinsics(1, 8, 8), height, width)
+        render(random_gaussians(3), Cameras(cameras(1), intrinsics(1, 8, 8), height, width))
 
 
 def test_wrong_shapes_are_named() -> None:
     scene, k = random_gaussians(3), intrinsics(1, 8, 8)
     with pytest.raises(ValueError, match=r"scales has shape \(3, 2\), expected \(3, 3\)"):
-        render(replace(scene, scales=scene.scales[:, :2]), cameras(1), k, 8, 8)
+        render(replace(scene, scales=scene.scales[:, :2]), Cameras(cameras(1), k, 8, 8))
     with pytest.raises(ValueError, match="5 coefficients"):
-        render(replace(scene, sh=torch.zeros(3, 5, 3)), cameras(1), k, 8, 8)
+        render(replace(scene, sh=torch.zeros(3, 5, 3)), Cameras(cameras(1), k, 8, 8))
     with pytest.raises(ValueError, match=r"intrinsics_px has shape \(2, 3, 3\), expected \(1, 3, 3\)"):
-        render(scene, cameras(1), intrinsics(2, 8, 8), 8, 8)
+        render(scene, Cameras(cameras(1), intrinsics(2, 8, 8), 8, 8))
     with pytest.raises(ValueError, match="world_from_cam has shape"):
-        render(scene, cameras(1)[0], k, 8, 8)
+        render(scene, Cameras(cameras(1)[0], k, 8, 8))
     with pytest.raises(ValueError, match="background has shape"):
-        render(scene, cameras(1), k, 8, 8, background=torch.zeros(4))
+        render(scene, Cameras(cameras(1), k, 8, 8), background=torch.zeros(4))
 
 
 def test_zero_quaternion_and_mixed_dtypes_are_named() -> None:
@@ -71,9 +72,9 @@ def test_zero_quaternion_and_mixed_dtypes_are_named() -> None:
     quats = scene.quat_wxyz.clone()
     quats[2] = 0
     with pytest.raises(ValueError, match="quat_wxyz row 2 has zero length"):
-        render(replace(scene, quat_wxyz=quats), cameras(1), k, 8, 8)
+        render(replace(scene, quat_wxyz=quats), Cameras(cameras(1), k, 8, 8))
     with pytest.raises(ValueError, match=r"opacities is torch\.float64"):
-        render(replace(scene, opacities=scene.opacities.double()), cameras(1), k, 8, 8)
+        render(replace(scene, opacities=scene.opacities.double()), Cameras(cameras(1), k, 8, 8))
 
 
 def test_bottom_row_of_the_view_matrix_is_checked() -> None:
@@ -105,4 +106,4 @@ def test_backends_refuse_what_they_cannot_render() -> None:
     scene = random_gaussians(3, dtype=torch.float64)
     poses, k = cameras(1, dtype=torch.float64), intrinsics(1, 8, 8, dtype=torch.float64)
     with pytest.raises(ValueError, match="gsplat backend needs CUDA"):
-        render(scene, poses, k, 8, 8, settings=RasterSettings(backend="gsplat"))
+        render(scene, Cameras(poses, k, 8, 8), settings=RasterSettings(backend="gsplat"))

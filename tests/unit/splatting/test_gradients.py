@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.splatting import kernel_backend, rasterise, render
 from tests.unit.splatting.backends import (
@@ -19,7 +20,7 @@ from tests.unit.splatting.backends import (
     needs_kernel,
     settings,
 )
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 
 @needs_kernel
@@ -31,7 +32,7 @@ def test_kernel_agrees_with_the_torch_oracle(sh_coefficients: int, antialiased: 
     pictures, slopes = [], []
     for backend in ("cpu", "torch"):
         chosen = settings(backend, antialiased=antialiased)
-        pictures.append(render(scene, poses, k, H, W, settings=chosen))
+        pictures.append(render(scene, Cameras(poses, k, H, W), settings=chosen))
         slopes.append(gradients(scene, poses, chosen))
     assert pictures[0].alpha.mean() > 0.2
     assert_same_pictures(*pictures, tolerance=2e-5)  # the fixtures' tolerance for float32 images
@@ -49,7 +50,7 @@ def test_every_build_draws_the_same(build: str, monkeypatch: pytest.MonkeyPatch)
         pytest.skip(f"no {build} here")
     monkeypatch.setattr(kernel_backend, "load_kernel", lambda: kernel)
     scene, poses, k = random_gaussians(400, sh_coefficients=9), cameras(2), intrinsics(2, H, W)
-    ours, exact = (render(scene, poses, k, H, W, settings=settings(backend)) for backend in ("cpu", "torch"))
+    ours, exact = (render(scene, Cameras(poses, k, H, W), settings=settings(backend)) for backend in ("cpu", "torch"))
     assert_same_pictures(ours, exact, tolerance=2e-5)
     for (name, slope), expected in zip(
         gradients(scene, poses, settings("cpu")).items(),
@@ -115,7 +116,7 @@ def test_gradients_of_several_views_are_the_sum_of_each_and_of_none_zero() -> No
 
     def gradient(views: slice) -> Tensor:
         leaf = scene.means.clone().requires_grad_()
-        picture = render(replace(scene, means=leaf), poses[views], k[views], H, W, settings=settings("cpu"))
+        picture = render(replace(scene, means=leaf), Cameras(poses[views], k[views], H, W), settings=settings("cpu"))
         (grad,) = torch.autograd.grad((picture.rgb**2).sum(), leaf)
         return grad
 

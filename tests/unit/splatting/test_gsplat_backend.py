@@ -17,7 +17,7 @@ from sceneexpander.splatting import RasterSettings
 from sceneexpander.splatting.gsplat_backend import rasterise_gsplat
 from sceneexpander.splatting.scene import RasterScene
 from sceneexpander.splatting.torch_backend import rasterise_torch
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 H, W = 20, 30
 

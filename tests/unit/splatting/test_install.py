@@ -13,10 +13,11 @@ import pytest
 import torch
 
 from sceneexpander.errors import UserError
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import RasterSettings, kernel_backend, render
 from sceneexpander.splatting.kernel import recipe
 from sceneexpander.splatting.rasterise import active_backend
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 ROOT = Path(__file__).parents[3]
 KERNEL = "src/sceneexpander/splatting/kernel"
@@ -42,19 +43,19 @@ def test_without_a_library_one_line_says_so_and_torch_renders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     scene, poses, lens = random_gaussians(50), cameras(1), intrinsics(1, 20, 30)
-    exact = render(scene, poses, lens, 20, 30, settings=RasterSettings(backend="torch"))
+    exact = render(scene, Cameras(poses, lens, 20, 30), settings=RasterSettings(backend="torch"))
     monkeypatch.setattr(kernel_backend, "KERNEL_DIRECTORY", tmp_path)
     kernel_backend.load_kernel.cache_clear()
     try:
         with caplog.at_level(logging.INFO):
-            seen = [render(scene, poses, lens, 20, 30) for _ in range(3)]
+            seen = [render(scene, Cameras(poses, lens, 20, 30)) for _ in range(3)]
         assert active_backend(torch.device("cpu"), torch.float32, RasterSettings()) == "torch"
         assert [record.getMessage().partition(",")[0] for record in caplog.records] == [
             "rasteriser: no compiled kernel beside the package"
         ]
         assert torch.equal(seen[2].rgb, exact.rgb)
         with pytest.raises(RuntimeError, match="install the package with a C\\+\\+ compiler"):
-            render(scene, poses, lens, 20, 30, settings=RasterSettings(backend="cpu"))
+            render(scene, Cameras(poses, lens, 20, 30), settings=RasterSettings(backend="cpu"))
     finally:
         monkeypatch.undo()
         kernel_backend.load_kernel.cache_clear()
@@ -78,7 +79,7 @@ def test_a_library_of_another_source_is_refused_in_one_line(tmp_path: Path, monk
     kernel_backend.load_kernel.cache_clear()
     try:
         with pytest.raises(UserError, match=r"_rasteriser_.*built from another source.*make setup") as refused:
-            render(random_gaussians(5), cameras(1), intrinsics(1, 8, 8), 8, 8)
+            render(random_gaussians(5), Cameras(cameras(1), intrinsics(1, 8, 8), 8, 8))
         assert "\n" not in refused.value.line()
     finally:
         monkeypatch.undo()

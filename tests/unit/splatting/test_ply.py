@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from sceneexpander.errors import UserError
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.splatting import render
 from sceneexpander.splatting.ply import read_ply, write_ply
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 XYZ, NORMALS, DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 SHAPE = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -63,7 +64,7 @@ def test_written_scenes_come_back_and_render_the_same(tmp_path: Path, sh_coeffic
     assert_same_scene(again, scene)
     assert torch.equal(again.source_view, scene.source_view)
     assert torch.equal(again.generated, scene.generated)
-    pictures = [render(s, cameras(1), intrinsics(1, 40, 50), 40, 50) for s in (scene, again)]
+    pictures = [render(s, Cameras(cameras(1), intrinsics(1, 40, 50), 40, 50)) for s in (scene, again)]
     assert (pictures[0].rgb - pictures[1].rgb).abs().max() < 1 / 255
     assert (pictures[0].generated - pictures[1].generated).abs().max() < 1 / 255
     assert [p.name for p in path.parent.iterdir()] == ["scene.ply"]  # no scratch files

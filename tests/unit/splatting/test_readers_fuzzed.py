@@ -15,7 +15,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.splatting.ply import read_ply, write_ply
 from sceneexpander.splatting.spz import read_spz, write_spz
-from tests.unit.splatting.scenes import random_gaussians
+from tests.worlds.random_gaussians import random_gaussians
 
 Reader = Callable[[Path], Gaussians]
 FORMATS: dict[str, tuple[Reader, Callable[[Gaussians, Path], object]]] = {

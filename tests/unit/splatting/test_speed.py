@@ -10,7 +10,7 @@ import torch
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.splatting import RasterSettings, rasterise
 from sceneexpander.splatting.kernel_backend import load_kernel
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 HEIGHT, WIDTH, COUNT = 144, 192, 20_000
 

@@ -14,11 +14,12 @@ import torch
 import zstandard
 
 from sceneexpander.errors import UserError
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import ROWS, Gaussians
 from sceneexpander.geometry.rigid import rotation_angle_deg, rotation_from_quat_wxyz
 from sceneexpander.splatting import render
 from sceneexpander.splatting.spz import HEADER, MAGIC, read_spz, write_spz
-from tests.unit.splatting.scenes import cameras, intrinsics, random_gaussians
+from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
 
 
 def bounded(count: int, sh_coefficients: int = 4) -> Gaussians:
@@ -53,12 +54,14 @@ def test_it_renders_the_same_within_what_the_format_allows(tmp_path: Path) -> No
     scene = bounded(400, 16)
     write_spz(scene, tmp_path / "a.spz")
     again = read_spz(tmp_path / "a.spz")
-    a, b = (render(s, cameras(2), intrinsics(2, 60, 80), 60, 80).rgb for s in (scene, again))
+    a, b = (render(s, Cameras(cameras(2), intrinsics(2, 60, 80), 60, 80)).rgb for s in (scene, again))
     # Several rounded bytes meet in a pixel, harmonics of degrees 2 and 3 being the coarsest by far.
     assert -10 * math.log10(float(((a - b) ** 2).mean())) > 35
     flat = replace(scene, sh=scene.sh[:, :1])  # what reconstructions here hold
     write_spz(flat, tmp_path / "b.spz")
-    a, b = (render(s, cameras(2), intrinsics(2, 60, 80), 60, 80).rgb for s in (flat, read_spz(tmp_path / "b.spz")))
+    a, b = (
+        render(s, Cameras(cameras(2), intrinsics(2, 60, 80), 60, 80)).rgb for s in (flat, read_spz(tmp_path / "b.spz"))
+    )
     assert -10 * math.log10(float(((a - b) ** 2).mean())) > 45
     assert float((a - b).abs().max()) < 8 / 255
 

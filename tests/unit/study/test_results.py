@@ -33,7 +33,7 @@ from sceneexpander.study.spec import Criterion
 from sceneexpander.study.statistics import scores_from_ranks
 from sceneexpander.study.store import Answer, Answers
 from tests.support.participants import bare_study
-from tests.unit.evaluation.test_table import row
+from tests.worlds.rows import row
 
 Opinion = Callable[[Participant, Screen], Sequence[str]]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sceneexpander.tracking import TrackingConfig, record_runs
-from tests.unit.tracking.test_store import record
+from tests.worlds.runs import record
 
 
 @pytest.fixture(scope="session")

@@ -24,7 +24,7 @@ from sceneexpander.tracking.describe import (
     saved_views,
 )
 from sceneexpander.tracking.store import NAMES, database_path, describe_experiments, last_experiment
-from tests.unit.tracking.test_store import CONFIG, client, record, runs
+from tests.worlds.runs import CONFIG, client, record, runs
 
 
 def tags(root: Path) -> dict[str, str]:

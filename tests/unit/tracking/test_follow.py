@@ -14,7 +14,7 @@ from sceneexpander.artifacts.live import LOG_NAME, LiveLog, LiveRun, LiveStep, r
 from sceneexpander.tracking import record_runs
 from sceneexpander.tracking.follow import STALE_S, Follower
 from sceneexpander.tracking.store import LIVE_TAG, NAMES
-from tests.unit.tracking.test_store import CONFIG, client, record, runs
+from tests.worlds.runs import CONFIG, client, record, runs
 
 FACTS = {"scene": "room", "round": 1, "steps": 3, "sections": {"adapt": {"steps": 3}}}
 OBJECTIVE, LOOKED = "4_loss/loss_with_inserted", "5_look/captured_psnr"

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from sceneexpander.errors import UserError
-from sceneexpander.processes import kept
+from sceneexpander.pipeline.processes import kept
 from sceneexpander.tracking import TrackingConfig, record_runs
 from sceneexpander.tracking.server import require_server, shown, where_runs_go
 from sceneexpander.tracking.store import (

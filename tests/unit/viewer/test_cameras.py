@@ -9,13 +9,13 @@ import torch
 
 from sceneexpander.geometry.rigid import look_at, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
-from sceneexpander.viewer.cameras import Cameras, alignment, frustum_length, up_direction
-from tests.unit.rendering.test_tour import reconstruction
+from sceneexpander.viewer.cameras import ShownCameras, alignment, frustum_length, up_direction
+from tests.worlds.row_of_views import reconstruction
 
 
-def cameras_around(up: torch.Tensor, count: int = 4) -> Cameras:
+def cameras_around(up: torch.Tensor, count: int = 4) -> ShownCameras:
     """Cameras on an arc, upright with respect to ``up``, looking at the origin from 3 away; the last one is generated."""
-    flat = Cameras.of(reconstruction("backbone", [float(i) for i in range(count)], generated=1))
+    flat = ShownCameras.of(reconstruction("backbone", [float(i) for i in range(count)], generated=1))
     side = torch.nn.functional.normalize(torch.linalg.cross(up, torch.tensor([0.3, 0.5, 0.9])), dim=0)
     ahead = torch.linalg.cross(up, side)
     angles = torch.linspace(-0.4, 0.4, count)[:, None]
@@ -32,7 +32,7 @@ def test_up_is_what_is_up_in_the_photos(up: tuple[float, float, float]) -> None:
 
 
 def test_up_ignores_the_generated_view_and_survives_cameras_that_cancel() -> None:
-    upright = Cameras.of(reconstruction("backbone", [0.0, 1.0, 2.0], generated=1))
+    upright = ShownCameras.of(reconstruction("backbone", [0.0, 1.0, 2.0], generated=1))
     poses = upright.world_from_cam.clone()
     poses[2, :3, :3] = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     assert up_direction(replace(upright, world_from_cam=poses)).tolist() == pytest.approx([0, -1, 0])
@@ -64,15 +64,15 @@ def test_nothing_moves_what_already_agrees_or_shares_nothing() -> None:
 
 
 def test_one_shared_camera_fixes_the_frame_but_not_the_scale() -> None:
-    main = Cameras.of(reconstruction("captured", [0.5]))
-    found = alignment(Cameras.of(reconstruction("backbone", [0.9])), main)
+    main = ShownCameras.of(reconstruction("captured", [0.5]))
+    found = alignment(ShownCameras.of(reconstruction("backbone", [0.9])), main)
     assert found.scale == 1.0
     torch.testing.assert_close(found.translation, torch.tensor([-0.4, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
 def test_frusta_scale_with_the_scene(scale: float) -> None:
-    length = frustum_length(Cameras.of(reconstruction("captured", [0.0, 0.4, 0.8], scale=scale)))
+    length = frustum_length(ShownCameras.of(reconstruction("captured", [0.0, 0.4, 0.8], scale=scale)))
     assert length == pytest.approx(0.35 * 0.4 * scale, rel=1e-5)
-    alone = frustum_length(Cameras.of(reconstruction("captured", [0.0], scale=scale)))
+    alone = frustum_length(ShownCameras.of(reconstruction("captured", [0.0], scale=scale)))
     assert alone == pytest.approx(0.12 * 2 * scale, rel=1e-5)

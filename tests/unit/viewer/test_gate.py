@@ -10,7 +10,7 @@ import pytest
 
 from sceneexpander.errors import UserError
 from sceneexpander.viewer.gate import check_authority, gate, reason_to_refuse
-from tests.unit.evaluation.made import made_reconstruction
+from tests.worlds.wall import made_reconstruction
 
 viser = pytest.importorskip("viser")
 TUNNEL = "box.example:9000"

@@ -13,6 +13,7 @@ import torch
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, concatenate
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.splatting import Render, render
@@ -26,7 +27,7 @@ from sceneexpander.viewer.packed import (
     unpack_splats,
     visible_weight,
 )
-from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
+from tests.worlds.row_of_views import HEIGHT, WIDTH, reconstruction
 
 
 def random_scene(count: int = 400, *, coefficients: int = 1, seed: int = 0) -> Reconstruction:
@@ -47,13 +48,13 @@ def random_scene(count: int = 400, *, coefficients: int = 1, seed: int = 0) -> R
 
 
 def see(reconstructed: Reconstruction, gaussians: Gaussians) -> torch.Tensor:
-    return render(gaussians, reconstructed.world_from_cam, reconstructed.intrinsics_px, HEIGHT, WIDTH).rgb
+    return render(gaussians, Cameras(reconstructed.world_from_cam, reconstructed.intrinsics_px, HEIGHT, WIDTH)).rgb
 
 
 def in_a_window(reconstructed: Reconstruction, gaussians: Gaussians) -> Render:
     """At the size of a window, twice that of the stored pictures."""
     lens = resize_intrinsics(reconstructed.intrinsics_px, 2, 2)
-    return render(gaussians, reconstructed.world_from_cam, lens, 2 * HEIGHT, 2 * WIDTH)
+    return render(gaussians, Cameras(reconstructed.world_from_cam, lens, 2 * HEIGHT, 2 * WIDTH))
 
 
 def test_a_round_trip_shows_the_same_scene() -> None:
@@ -123,7 +124,7 @@ def test_as_many_are_kept_as_the_worst_view_needs(monkeypatch: pytest.MonkeyPatc
 def test_weights_are_shares_of_pixels() -> None:
     scene = random_scene()
     with torch.no_grad():
-        alpha = render(scene.gaussians, scene.world_from_cam, scene.intrinsics_px, HEIGHT, WIDTH).alpha
+        alpha = render(scene.gaussians, Cameras(scene.world_from_cam, scene.intrinsics_px, HEIGHT, WIDTH)).alpha
     # Every pixel's alpha is the sum of the shares in it.
     assert float(visible_weight(scene).sum()) == pytest.approx(float(alpha.sum()), rel=1e-4)
 

@@ -11,7 +11,7 @@ import torch
 
 from sceneexpander.viewer.packed import BYTES_PER_SPLAT, SPLATS_PER_METHOD, PackedSplats, pack_splats
 from sceneexpander.viewer.page import ShownMethod, viewer_page
-from tests.unit.rendering.test_tour import reconstruction
+from tests.worlds.row_of_views import reconstruction
 
 NASTY = '</script><script>alert(1)</script> & "quotes"'
 

@@ -13,7 +13,7 @@ from sceneexpander.geometry.gaussians import sh_from_rgb
 from sceneexpander.geometry.rigid import look_at, rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.splatting.video import GENERATED_TINT
-from sceneexpander.viewer.cameras import Cameras
+from sceneexpander.viewer.cameras import ShownCameras
 from sceneexpander.viewer.viser_axes import (
     LEAST_STD_PX,
     TINT_STRENGTH,
@@ -23,7 +23,7 @@ from sceneexpander.viewer.viser_axes import (
     viser_splats,
     widened,
 )
-from tests.unit.rendering.test_tour import HEIGHT, WIDTH, reconstruction
+from tests.worlds.row_of_views import HEIGHT, WIDTH, reconstruction
 
 STAY = Similarity(scale=1.0, rotation=torch.eye(3), translation=torch.zeros(3))
 
@@ -32,7 +32,7 @@ def test_a_camera_keeps_its_axes_and_its_lens() -> None:
     pose = look_at(torch.tensor([1.0, -2.0, 0.5]), torch.tensor([0.0, 0.0, 4.0]), torch.tensor([0.1, -1.0, 0.2]))
     lens = torch.tensor([[30.0, 0, 14.0], [0, 40.0, 10.5], [0, 0, 1]])
     cameras = replace(
-        Cameras.of(reconstruction("captured", [0.0])), world_from_cam=pose[None], intrinsics_px=lens[None]
+        ShownCameras.of(reconstruction("captured", [0.0])), world_from_cam=pose[None], intrinsics_px=lens[None]
     )
     camera = viser_camera(cameras, 0)
     rotation = rotation_from_quat_wxyz(torch.tensor(camera.wxyz))
@@ -96,7 +96,7 @@ def test_narrow_gaussians_are_widened_in_the_view_that_made_them() -> None:
     scene = reconstruction("captured", [0.0, 0.4])
     flat = torch.tensor([[0.01, 0.001, 0.3], [0.5, 0.4, 0.002]])
     gaussians = replace(scene.gaussians.select(torch.arange(2)), scales=flat)
-    found = widened(gaussians, Cameras.of(scene)).scales
+    found = widened(gaussians, ShownCameras.of(scene)).scales
     least = LEAST_STD_PX * 2.0 / 25.0  # depth 2, focal length 25
     expected = torch.tensor([[least, 0.001, 0.3], [0.5, 0.4, 0.002]])
     torch.testing.assert_close(found, expected)

@@ -22,6 +22,7 @@ from sceneexpander.generation.protocol import Forecast, GenerationContext, Scene
 from sceneexpander.generation.source_picture import png_bytes
 from sceneexpander.generation.start import CENTRAL, moved_camera, start_view
 from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting.render import render
 
 _MOSTLY_SEEN = 0.5  # of what covers a pixel: below it, the pixel counts as not seen
@@ -108,7 +109,7 @@ def seen_from_motion(
     views, scene = so_far.views, so_far.reconstruction
     height, width = views.detail_images.shape[-2:]
     intrinsics = resize_intrinsics(scene.intrinsics_px[view], width / views.width, height / views.height)
-    seen = render(scene.gaussians, pose[None], intrinsics[None], height, width)
+    seen = render(scene.gaussians, Cameras(pose[None], intrinsics[None], height, width))
     share = float((seen.alpha[0] >= _MOSTLY_SEEN).float().mean())
     if share < _TOO_LITTLE_SEEN:
         problem = f"leads to where the photos show only {share:.0%} of the picture"

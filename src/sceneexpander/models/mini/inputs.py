@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sceneexpander.geometry.camera import pixel_centres, resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gauge import poses_relative_to
 from sceneexpander.geometry.lookup import grid_of_pixels, warp_known, warp_maps
 from sceneexpander.geometry.normals import normals_from_depth, viewing_rays
@@ -41,8 +42,8 @@ class MeasuredPriors:
     known: Bool[Tensor, "view height width"] | None  # where there is a base depth; None: everywhere
     confident: Float[Tensor, "view height width"]  # 1 where the base is probably right
     posed: Bool[Tensor, "view"]
-    log_depth_fine: Float[Tensor, "view height width"]  # at the working resolution
-    confident_fine: Float[Tensor, "view height width"]
+    log_depth_fine: Float[Tensor, "view fine_height fine_width"]  # at the working resolution
+    confident_fine: Float[Tensor, "view fine_height fine_width"]
     coarse: Float[Tensor, "view channel out_height out_width"]  # all coarse channels but the cross-view ones
     base_normals: Float[Tensor, "view out_height out_width 3"]
     pairs: PairGeometry  # of all views that were measured together
@@ -187,7 +188,7 @@ def measure(priors: Priors | None, views: int, height: int, width: int, config: 
             dim=1,
         ),
         base_normals=base_normals,
-        pairs=PairGeometry(half[:, 0] - scale.log(), half[:, 1], poses, intrinsics, posed),
+        pairs=PairGeometry(half[:, 0] - scale.log(), half[:, 1], Cameras(poses, intrinsics, *out_size), posed),
         views=tuple(range(views)),
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +15,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sceneexpander.errors import UserError
-from sceneexpander.geometry.camera import camera_vector_from_pose, pose_from_camera_vector, unproject_to_world
+from sceneexpander.files import complete_file
+from sceneexpander.geometry.camera import camera_vector_from_pose, pose_from_camera_vector
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.normals import face_camera, viewing_rays
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.layers.family import set_views_per_chunk
@@ -112,6 +113,7 @@ class Mini(nn.Module):
         camera_vector, world_from_cam, intrinsics = self._cameras(
             features.camera_tokens, priors, prepared.scale, height, width
         )
+        cameras = Cameras(world_from_cam, intrinsics, height, width)
         wants_depth = bool(heads & {Head.DEPTH, Head.POINTS, Head.GAUSSIANS})
         wants_normals = bool(heads & {Head.NORMALS, Head.GAUSSIANS})
         depth = depth_conf = normals = normals_conf = points = None
@@ -126,14 +128,13 @@ class Mini(nn.Module):
             normals = face_camera(upsampled[:, :3].movedim(1, -1), rays)
             normals_conf = 1 + upsampled[:, 3].clamp(max=10).exp()
         if depth is not None and Head.POINTS in heads:
-            points = unproject_to_world(depth, intrinsics, world_from_cam)
+            points = cameras.unproject(depth)
         if depth is not None and depth_conf is not None and normals is not None and Head.GAUSSIANS in heads:
             flags = torch.zeros(views, dtype=torch.bool, device=images.device) if generated is None else generated
             transparent = covered_by_others(
                 depth,
                 priors.confident,
-                world_from_cam,
-                intrinsics,
+                cameras,
                 priors.posed,
                 most_views=self.config.cross_views,
             )
@@ -142,8 +143,7 @@ class Mini(nn.Module):
                 depth,
                 depth_conf,
                 normals,
-                world_from_cam,
-                intrinsics,
+                cameras,
                 transparent,
                 _upsample(self.network.gaussian_head(features.dense), height, width),
                 flags,
@@ -192,12 +192,8 @@ class Mini(nn.Module):
     def save_weights(self, path: Path) -> None:
         """Write the weights in half precision with the configuration, atomically."""
         tensors = {name: value.detach().half().contiguous() for name, value in self.state_dict().items()}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        save_file(tensors, scratch, {_CONFIG_KEY: json.dumps(self.config.to_dict())})
-        with scratch.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(scratch, path)
+        with complete_file(path) as scratch:
+            save_file(tensors, scratch, {_CONFIG_KEY: json.dumps(self.config.to_dict())})
 
     def _cameras(
         self, tokens: Float[Tensor, "view dim"], priors: MeasuredPriors, scene_scale: float, height: int, width: int

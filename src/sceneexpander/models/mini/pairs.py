@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneexpander.geometry.lookup import project_to_views, sample_at
+from sceneexpander.geometry.cameras import Cameras
+from sceneexpander.geometry.lookup import sample_at
 from sceneexpander.geometry.normals import viewing_rays
-from sceneexpander.geometry.rigid import rigid_inverse, transform_points
+from sceneexpander.geometry.rigid import transform_points
 
 CROSS_VIEW_CHANNELS = 6  # see `PairGeometry.compare`
 
@@ -42,8 +43,7 @@ class PairGeometry:
     Args:
         log_depth: natural logarithm of the base depth, in the poses' scale.
         confident: share of confident pixels.
-        world_from_cam: camera poses.
-        intrinsics_px: intrinsics at the resolution of the depth.
+        cameras: at the resolution of the depth.
         posed: views whose pose is only a placeholder take no part.
     """
 
@@ -51,18 +51,15 @@ class PairGeometry:
         self,
         log_depth: Float[Tensor, "view height width"],
         confident: Float[Tensor, "view height width"],
-        world_from_cam: Float[Tensor, "view 4 4"],
-        intrinsics_px: Float[Tensor, "view 3 3"],
+        cameras: Cameras,
         posed: Bool[Tensor, "view"],
     ) -> None:
-        height, width = log_depth.shape[-2:]
-        points_cam = viewing_rays(intrinsics_px, height, width) * log_depth.exp()[..., None]
-        self.points_world = transform_points(world_from_cam, points_cam.flatten(1, 2))
-        self.cam_from_world = rigid_inverse(world_from_cam)
-        self.intrinsics_px = intrinsics_px
+        points_cam = viewing_rays(cameras.intrinsics_px, cameras.height, cameras.width) * log_depth.exp()[..., None]
+        self.points_world = transform_points(cameras.world_from_cam, points_cam.flatten(1, 2))
+        self.cameras = cameras
         self.content = torch.stack([log_depth, confident], dim=1)
         self.posed: list[bool] = posed.tolist()
-        centres = world_from_cam[:, :3, 3]
+        centres = cameras.centres
         self.distances = (centres[:, None] - centres).square().sum(-1).tolist()
         self._known: dict[tuple[int, int], Pairs] = {}
 
@@ -84,26 +81,18 @@ class PairGeometry:
 
     def _measure(self, view: int, others: Sequence[int]) -> Pairs:
         chosen = torch.tensor(others, device=self.points_world.device)
-        height, width = self.content.shape[-2:]
-        grid, z, in_frame = project_to_views(
-            self.points_world[view], self.cam_from_world[chosen], self.intrinsics_px[chosen], height, width
-        )
-        seen = sample_at(self.content[chosen], grid)
+        seen, found = self.cameras[chosen].look_up(self.points_world[view], self.content[chosen])
         nearest = [
             splat_log_depth(
-                self.points_world[other][self.content[other, 1].flatten() > 0.5],
-                self.cam_from_world[view],
-                self.intrinsics_px[view],
-                height,
-                width,
+                self.points_world[other][self.content[other, 1].flatten() > 0.5], self.cameras[view]
             ).flatten()
             for other in others
         ]
         return Pairs(
-            grid=grid,
-            in_frame=in_frame,
-            behind=(z.log() - seen[:, 0]).clamp(-1, 1),
-            weight=seen[:, 1] * in_frame,
+            grid=found.grid,
+            in_frame=found.in_frame,
+            behind=(found.depth.log() - seen[:, 0]).clamp(-1, 1),
+            weight=seen[:, 1] * found.in_frame,
             nearest=torch.stack(nearest),
         )
 
@@ -144,29 +133,12 @@ class PairGeometry:
         return torch.unflatten(out, -1, (height, width))
 
 
-def sample_other_views(
-    points_world: Float[Tensor, "point 3"],
-    content: Float[Tensor, "other channel height width"],
-    cam_from_world: Float[Tensor, "other 4 4"],
-    intrinsics_px: Float[Tensor, "other 3 3"],
-) -> tuple[Float[Tensor, "other channel point"], Float[Tensor, "other point"], Bool[Tensor, "other point"]]:
-    """(content of other views where the points project, log of the points' depth there, whether they are in frame)."""
-    height, width = content.shape[-2:]
-    grid, z, in_frame = project_to_views(points_world, cam_from_world, intrinsics_px, height, width)
-    return sample_at(content, grid), z.log(), in_frame
-
-
-def splat_log_depth(
-    points_world: Float[Tensor, "point 3"],
-    cam_from_world: Float[Tensor, "4 4"],
-    intrinsics_px: Float[Tensor, "3 3"],
-    height: int,
-    width: int,
-) -> Float[Tensor, "height width"]:
-    """Log depth of the nearest point that falls in each pixel, infinite where there is none."""
-    points = transform_points(cam_from_world, points_world)
+def splat_log_depth(points_world: Float[Tensor, "point 3"], camera: Cameras) -> Float[Tensor, "height width"]:
+    """Log depth of the nearest point that falls in each pixel of one camera, infinite where there is none."""
+    height, width = camera.height, camera.width
+    points = transform_points(camera.cam_from_world[0], points_world)
     depth = points[:, 2]
-    pixel = (points @ intrinsics_px.T)[:, :2] / depth.clamp(min=1e-6)[:, None]
+    pixel = (points @ camera.intrinsics_px[0].T)[:, :2] / depth.clamp(min=1e-6)[:, None]
     column, row = pixel.floor().long().unbind(-1)
     kept = (depth > 1e-6) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     nearest = depth.new_full((height * width,), torch.inf)

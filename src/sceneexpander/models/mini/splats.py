@@ -9,12 +9,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
-from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.models.mini.config import MiniConfig
 from sceneexpander.models.mini.inputs import SAME_SURFACE
-from sceneexpander.models.mini.pairs import sample_other_views
 from sceneexpander.models.pixel_aligned import SplatRule, pixel_aligned
 
 SPLAT_RESIDUALS = 4  # log scale along the slant, log scale across, opacity logit, log depth offset
@@ -32,8 +30,7 @@ def pixel_aligned_gaussians(
     depth: Float[Tensor, "view height width"],
     depth_conf: Float[Tensor, "view height width"],
     normals: Float[Tensor, "view height width 3"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     transparent: Float[Tensor, "view height width"],
     residuals: Float[Tensor, "view 4 height width"],
     generated: Bool[Tensor, "view"],
@@ -51,8 +48,7 @@ def pixel_aligned_gaussians(
         images=images,
         depth=splat_depth,
         depth_conf=depth_conf,
-        world_from_cam=world_from_cam,
-        intrinsics_px=intrinsics_px,
+        cameras=cameras,
         normals=normals,
         generated=generated,
         scale_factors=functional.pad(learned, (0, 1), value=1.0),
@@ -85,8 +81,7 @@ def snap_to_surfaces(depth: Float[Tensor, "view height width"]) -> Float[Tensor,
 def covered_by_others(
     depth: Float[Tensor, "view height width"],
     confident: Float[Tensor, "view height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     posed: Bool[Tensor, "view"],
     *,
     most_views: int,
@@ -103,9 +98,8 @@ def covered_by_others(
         return out
     log_depth = depth.log()
     content = torch.stack([log_depth, confident], dim=1)
-    points = unproject_to_world(depth, intrinsics_px, world_from_cam).flatten(1, 2)
-    cam_from_world = rigid_inverse(world_from_cam)
-    centres = world_from_cam[:, :3, 3]
+    points = cameras.unproject(depth).flatten(1, 2)
+    centres = cameras.centres
     tolerance = torch.tensor(SAME_SURFACE).log()
     for view in range(views):
         candidates = posed.clone()
@@ -115,9 +109,8 @@ def covered_by_others(
             continue
         distance = (centres[others] - centres[view]).square().sum(-1)
         others = others[distance.argsort()[:most_views]]
-        seen, log_z, in_frame = sample_other_views(
-            points[view], content[others], cam_from_world[others], intrinsics_px[others]
-        )
+        seen, found = cameras[others].look_up(points[view], content[others])
+        log_z, in_frame = found.depth.log(), found.in_frame
         sees = in_frame & (log_z < seen[:, 0] + tolerance)
         if bool(posed[view]):
             covered = (seen[:, 1] * sees).amax(0).view(height, width) * (1 - confident[view])

@@ -44,9 +44,9 @@ class BatchPriors:
 class EncodedPriors:
     """Priors as the trunk embeds them: one row for each listed view."""
 
-    cameras: Float[Tensor, "batch given 9"] | None = None
+    cameras: Float[Tensor, "batch given_cameras 9"] | None = None
     camera_views: tuple[int, ...] = ()
-    depth: Float[Tensor, "batch given 2 height width"] | None = None
+    depth: Float[Tensor, "batch given_depths 2 height width"] | None = None
     depth_views: tuple[int, ...] = ()
 
 
