@@ -9,17 +9,8 @@ import pytest
 
 from sceneexpander.report import SceneSource, collect_scene, write_page
 from tests.support.browser import Page, browser_page
+from tests.support.pages import NARROW, SCROLLING, STICKING_OUT, WIDE
 from tests.worlds.reports_with_cameras import with_cameras
-
-WIDE, NARROW = 1280, 390
-# Elements that stick out, or that scroll within themselves.
-STICKING_OUT = """[...document.querySelectorAll('main *')].filter(e => {
-  const box = e.getBoundingClientRect();
-  return box.width && (box.right > innerWidth + 1 || box.left < -1);
-}).map(e => e.tagName + '.' + e.className)"""
-SCROLLING = """[...document.querySelectorAll('main *')].filter(e =>
-  e.scrollWidth > e.clientWidth + 1 && ['auto', 'scroll'].includes(getComputedStyle(e).overflowX)
-).map(e => e.tagName + '.' + e.className)"""
 
 
 @pytest.fixture(scope="module")

@@ -17,14 +17,13 @@ from sceneexpander.report import SceneSource, collect_scene, write_page
 from sceneexpander.report.media import SIDE_PX
 from sceneexpander.report.site import FULL_SCENES
 from tests.support.browser import browser_page
-from tests.unit.report.test_page import Links, source  # noqa: F401 - fixture
-from tests.unit.report.test_page_in_browser import NARROW, SCROLLING, STICKING_OUT, WIDE
+from tests.support.pages import NARROW, SCROLLING, STICKING_OUT, WIDE, Links
 
 MANY = tuple(f"scene_{number}" for number in range(FULL_SCENES + 1))
 
 
 @pytest.fixture(scope="module")
-def pages(source: SceneSource, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811 - the fixture
+def pages(source: SceneSource, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Gathered scenes of different names; the first one's pictures are larger than a site of many shows them."""
     folder = tmp_path_factory.mktemp("pages")
     first = folder / MANY[0]

@@ -10,7 +10,7 @@ from pathlib import Path
 from sceneexpander.artifacts.metrics import MetricsRow
 from sceneexpander.report import SceneSource, collect_scene
 from sceneexpander.report.sweep import SweptJob, write_sweep_page
-from tests.unit.report.test_page import Links, source  # noqa: F401 - fixture
+from tests.support.pages import Links
 
 JOBS = (
     SweptJob(label="ablation=baseline", folder="0"),
@@ -19,7 +19,7 @@ JOBS = (
 )
 
 
-def test_jobs_stand_side_by_side(source: SceneSource, tmp_path: Path) -> None:  # noqa: F811 - the fixture
+def test_jobs_stand_side_by_side(source: SceneSource, tmp_path: Path) -> None:
     collect_scene(source, tmp_path / "0" / "pages" / "room")
     shutil.copytree(tmp_path / "0", tmp_path / "1")
     place = tmp_path / "1" / "pages" / "room" / "round_1" / "sceneexpander" / "metrics.json"

@@ -28,7 +28,7 @@ from sceneexpander.tracking.store import (
     quiet_environment,
     without_foreign_settings,
 )
-from tests.unit.tracking.test_store import record
+from tests.worlds.runs import record
 
 WRITERS = 3
 
