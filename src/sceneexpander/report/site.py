@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from sceneexpander.artifacts.metrics import Row, load_row
+from sceneexpander.artifacts.metrics import MetricsRow, Row, load_row
 from sceneexpander.artifacts.page import ScenePage
 from sceneexpander.catalogue import ARROWS, MAIN, Metric, Table
 from sceneexpander.catalogue.metrics import metrics_named
@@ -39,9 +39,9 @@ class _Copied:
     def rows(self) -> list[Row]:
         """Of all rounds and methods. The scene goes by its folder, of which there is one in a site."""
         return [
-            replace(load_row(self.source / method.metrics), scene=self.name, round=item.number)
+            replace(load_row(self.source / place), scene=self.name, round=item.number)
             for item in self.page.rounds
-            for method in (*item.methods, *item.unavailable)
+            for place in (*(made.metrics for made in item.methods), *(none.metrics for none in item.unavailable))
         ]
 
 
@@ -104,7 +104,7 @@ def _card(scene: _Copied) -> dict[str, Any]:
     main = next((method for method in last.methods if method.name == MAIN), None)
     numbers: list[str] = []
     if main is not None:
-        row = load_row(scene.source / main.metrics)
+        row = MetricsRow.load(scene.source / main.metrics)
         known = [(metric, row.value(metric.name)) for metric in _HEADLINE]
         numbers = [f"{metric.title} {metric.text_with_unit(value)}" for metric, value in known if value is not None]
     return {
