@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from sceneexpander.catalogue import MAIN
+from sceneexpander.pipeline.unasked import METHODS_FILE
 
 SCENES = Path("scenes")
 OUTPUTS = Path("outputs")
@@ -20,6 +22,11 @@ RECORDED = "recorded"  # in a round's folder of what was asked for: a copy of th
 REFINEMENT = "refinement.json"  # beside a reconstruction whose Gaussians were refined: what it changed
 
 
+def gathered_scenes(scenes: Sequence[str]) -> list[str]:
+    """Those of ``scenes`` that there is something to show of; the others failed on their way."""
+    return [scene for scene in scenes if (PAGES / scene).is_dir()]
+
+
 def source(scene: str) -> Path:
     """The user's folder: photos, scene.yaml, recorded pictures."""
     return SCENES / scene
@@ -32,7 +39,7 @@ def config(scene: str) -> Path:
 
 def selection(scene: str) -> Path:
     """Which methods params.yaml asks for: one key per method that is not always made."""
-    return OUTPUTS / scene / "methods.yaml"
+    return OUTPUTS / scene / METHODS_FILE
 
 
 def given(scene: str, kind: str) -> Path:

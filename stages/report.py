@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from sceneexpander.artifacts.judgement import JudgedRound
-from sceneexpander.artifacts.metrics import MetricsRow, Row, load_row
+from sceneexpander.artifacts.metrics import MetricsRow, Row, UnavailableRow, load_row
 from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.judged import with_judged
@@ -18,6 +19,8 @@ from stages import layout
 from stages.runner import Cell, stage
 
 RESULTS = Path("results/metrics.json")
+LOST_SCENE = "missing: a stage of the scene failed"
+_log = logging.getLogger(__name__)
 
 
 def _digits(value: float) -> float:
@@ -32,7 +35,8 @@ def main(_: Cell) -> None:
     rows: list[Row] = []
     judged: list[JudgedRound] = []
     numbers: dict[str, dict[str, dict[str, dict[str, float | str]]]] = {}
-    for scene in selected.scenes:
+    scenes = layout.gathered_scenes(selected.scenes)
+    for scene in scenes:
         for number in range(1, selected.rounds + 1):
             judged.append(JudgedRound.load(layout.PAGES / scene / f"round_{number}"))
             for method in selected.methods:
@@ -47,8 +51,19 @@ def main(_: Cell) -> None:
                 numbers.setdefault(scene, {}).setdefault(f"round_{number}", {})[method] = known
     if not rows:
         raise UserError("selects nothing to report", where="params.yaml", fix="name scenes, rounds and methods")
+    missing = [scene for scene in selected.scenes if scene not in scenes]
+    for scene in missing:
+        _log.warning("scene %s is missing: a stage before failed", scene)
+        for number in range(1, selected.rounds + 1):
+            for method in selected.methods:
+                model = next((known.model for known in rows if known.method == method), "")
+                row = UnavailableRow(
+                    scene=scene, round=number, method=method, model=model, seed=rows[0].seed, reason=LOST_SCENE
+                )
+                rows.append(row)
+                numbers.setdefault(scene, {}).setdefault(f"round_{number}", {})[method] = {"unavailable": row.reason}
     with directory_being_written(layout.REPORT) as folder:
-        write_page([layout.PAGES / scene for scene in selected.scenes], folder)
+        write_page([layout.PAGES / scene for scene in scenes], folder, missing=missing)
         for name, table in (("comparison", comparison_table(rows)), ("scenes", scene_table(rows))):
             for ending, text in (("md", table.markdown()), ("csv", table.csv()), ("tex", table.latex())):
                 write_bytes_atomic(folder / f"{name}.{ending}", text.encode())

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sceneexpander.artifacts.store import keep_newest, read_json, write_json_atomic
-from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.config.files import read_yaml
 from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, disk_full, interruptible
-from sceneexpander.files import directory_being_written, write_bytes_atomic
+from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.packages import installed_packages
 from sceneexpander.pipeline.processes import end_with_parent
 from sceneexpander.pipeline.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
+from sceneexpander.pipeline.unasked import write_unasked
 from stages import layout
 
 STAGE_ENV = "DVC_STAGE"  # set by DVC for the commands that it runs
@@ -195,13 +195,11 @@ def _measured(path: Path | None) -> Iterator[None]:
 def left_out(cell: Cell) -> bool:
     """Whether params.yaml does not ask for the cell's method; then that is written down in place of its result.
 
-    The pipeline always has a stage for every method that can be asked for: its stages are fixed before params.yaml's list is read.
+    `sceneexpander.pipeline.unasked` does the same without a process; this is for stages that something else starts, e.g. ``dvc repro``.
     """
     if read_yaml(layout.selection(cell.scene))[cell.method]:
         return False
-    reason = Unavailable(method=cell.method, model="", reason="was not asked for")
-    with directory_being_written(layout.reconstruction(cell.scene, cell.round, cell.method).parent) as folder:
-        reason.save(folder / "reconstruction")
+    write_unasked(cell.method, layout.reconstruction(cell.scene, cell.round, cell.method).parent)
     return True
 
 

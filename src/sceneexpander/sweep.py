@@ -6,36 +6,52 @@ folders of ``scenes/``; without it the scenes are those of params.yaml, and so a
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
+import shlex
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sceneexpander.artifacts.store import read_json, read_typed, to_plain, write_json_atomic
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose, scene_option
-from sceneexpander.config.overrides import environment_hidden, key_of, written_out
+from sceneexpander.config.overrides import environment_hidden, key_of, override, written_out
 from sceneexpander.config.parse import ConfigError
-from sceneexpander.errors import UserError, did_you_mean, disk_full, entry_point
+from sceneexpander.errors import EXIT_BAD_INPUT, UserError, did_you_mean, disk_full, entry_point, printable
 from sceneexpander.pipeline.disk import remove_tree
+from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import CHECKED_SECTIONS, Checked, check_scene
 from sceneexpander.pipeline.processes import run_group
 from sceneexpander.pipeline.project import ROOT_ENV, find_project
 from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, reproduce_shared
+from sceneexpander.report.sweep import SweptJob, write_sweep_page
 from sceneexpander.typed import shorten
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override
     from omegaconf import DictConfig
 
-INNER_ENV = "SCENEEXPANDER_SWEEP_RUNS"  # set in the process that runs Hydra, which ends with the one that the user sees
-SCENE_KEY = "scene"  # the axis as people write it
-_HYDRA_SCENE_KEY = "+swept_scene"  # as Hydra gets it: its own group ``scene`` holds settings, not folders
+INNER_ENV = "SCENEEXPANDER_SWEEP_RUNS"  # in the process that runs Hydra, which ends with the one that the user sees: the sweep's folder
+# Not as a program of its own: launchers send the jobs' classes to other processes by the name of their module, which must not be __main__.
+_INNER = "from sceneexpander.sweep import main; main()"
+SCENE_KEY = "scene"  # the axis: folders of scenes/, while Hydra's group of this name holds settings
+_JOB_KEY = "+swept_job"  # the one axis that Hydra gets: numbers of jobs, so that any of them can be started again
+SWEEP_FILE, STATE_FILE = "sweep.json", "job.json"  # in the folders of a sweep and of a job
+_DECIDED = (
+    "hydra.sweep.subdir",
+    "hydra.job.num",
+    "hydra/sweeper",
+    "hydra.mode",
+)  # otherwise no job could be found again
 MOST_VALUES = 1000  # of one key: each is a run of its own
-KEPT = ("outputs/report", "outputs/pages", "params.yaml", "dvc.lock")  # of a finished job; the rest is in the cache
+REPORT, PAGES = "outputs/report", "outputs/pages"
+KEPT = (REPORT, PAGES, "params.yaml", "dvc.lock")  # of a finished job; the rest is in the cache
 _CHECKED = Checked()  # by this process: pictures and weights that jobs share are read once
 
 
@@ -57,15 +73,65 @@ class Job:
         return replace(base, scenes=scenes, overrides=merged_overrides(base.overrides, self.overrides, project=project))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sweep:
+    """What a sweep's folder says about it.
+
+    Attributes:
+        hydra: Hydra's own settings, e.g. which launcher.
+        jobs: all combinations; the folder of each is its number.
+    """
+
+    hydra: tuple[str, ...]
+    jobs: tuple[Job, ...]
+    schema: str = "sweep/1"
+
+    @classmethod
+    def load(cls, folder: Path) -> Sweep:
+        """Raises `UserError` if the folder is none of a sweep."""
+        if not (folder / SWEEP_FILE).is_file():
+            raise UserError("holds no sweep", where=folder, fix="name a folder of multirun/")
+        return read_typed(cls, read_json(folder / SWEEP_FILE), folder / SWEEP_FILE)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobState:
+    """How far a job is. ``started`` without anything else: it runs, or was killed."""
+
+    started: bool = False
+    done: bool = False
+    error: str = ""
+    schema: str = "job/1"
+
+
+def job_state(sweep: Path, number: int) -> JobState:
+    """Of one job of a sweep's folder."""
+    path = sweep / str(number) / STATE_FILE
+    return read_typed(JobState, read_json(path), path) if path.is_file() else JobState()
+
+
 def run_job(folder: Path, job: Job, project: Path, *, sweep: str | None = None) -> None:
     """One combination: make its workspace, run it, keep its pages.
 
     Raises:
         RuntimeError: the pipeline failed. (Not SystemExit: that would end the whole sweep.)
     """
+    folder.mkdir(parents=True, exist_ok=True)
+    with run_lock(folder / "workspace"):  # one that outlived its sweep may still be at work
+        write_json_atomic(folder / STATE_FILE, to_plain(JobState(started=True)))
+        try:
+            _run_job(folder, job, project, sweep)
+        except Exception as error:
+            line = str(error).partition("\n")[0] or type(error).__name__
+            write_json_atomic(folder / STATE_FILE, to_plain(JobState(started=True, error=line)))
+            raise
+        write_json_atomic(folder / STATE_FILE, to_plain(JobState(started=True, done=True)))
+
+
+def _run_job(folder: Path, job: Job, project: Path, sweep: str | None) -> None:
     selection = job.selection(read_selection(project), project)
     try:
-        _check(selection, project)
+        _check(selection, project, device=True, store=False)
         workspace = make_workspace(folder / "workspace", selection, project=project)
         reproduce_shared(workspace, project=project, sweep=sweep)
     except UserError as error:
@@ -73,12 +139,13 @@ def run_job(folder: Path, job: Job, project: Path, *, sweep: str | None = None) 
     for name in KEPT:
         source, target = workspace / name, folder / name
         if source.exists():
+            remove_tree(target)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(source, target)
     remove_tree(workspace)
 
 
-def _check(selection: Selection, project: Path, *, device: bool = True) -> None:
+def _check(selection: Selection, project: Path, *, device: bool, store: bool) -> None:
     for scene in selection.scenes:
         check_scene(
             scene,
@@ -89,15 +156,17 @@ def _check(selection: Selection, project: Path, *, device: bool = True) -> None:
             round_overrides=selection.round_overrides,
             methods=selection.methods,
             device=device,
+            store=store,
             checked=_CHECKED,
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axes:
-    """A checked command line: as Hydra gets it, and jobs in which every value of every axis occurs."""
+    """A checked command line: the sweep, where it is to be, and jobs in which every value of every axis occurs."""
 
-    arguments: list[str]
+    sweep: Sweep
+    folder: Path
     jobs: tuple[Job, ...]
 
 
@@ -112,10 +181,10 @@ def check_axes(arguments: Sequence[str], project: Path) -> Axes:
         UserError: one line about the first option, axis or value that there is not.
     """
     options = [item for item in arguments if item.startswith("-")]
-    known = ("--multirun", "-m")
+    known = ("--multirun", "-m", "--retry")
     for option in options:
         if option not in known:
-            raise UserError("unknown option", where=shorten(option), fix=did_you_mean(shorten(option), known[:1]))
+            raise UserError("unknown option", where=shorten(option), fix=did_you_mean(shorten(option), known))
     given = [item for item in arguments if not item.startswith("-")]
     for item in given:
         if "=" not in item and not item.startswith("~"):
@@ -125,10 +194,14 @@ def check_axes(arguments: Sequence[str], project: Path) -> Axes:
         raise UserError("is given twice", where=SCENE_KEY, fix="write scene=a,b")
     names = _scene_names(scenes[0], project) if scenes else []
     items = list(written_out([item for item in given if item not in scenes], absolute=True, sweep=True))
+    for item in items:
+        if key_of(item) in _DECIDED:
+            raise UserError("is decided by the sweep", where=shorten(item), fix="leave it out")
     base = read_selection(project)
+    found, folder = _axes(items, project / "conf")
     axes = {
         item: [f"{item.partition('=')[0]}={value}" if "=" in item else item for value in values]
-        for item, values in _axes(items, project / "conf").items()
+        for item, values in found.items()
         if key_of(item).partition("/")[0].partition(".")[0] != "hydra"
     }
     several = next((item for item, values in axes.items() if len(values) > 1), scenes[0] if len(names) > 1 else None)
@@ -143,8 +216,13 @@ def check_axes(arguments: Sequence[str], project: Path) -> Axes:
         selection = job.selection(base, project)
         for scene in selection.scenes:
             compose(project / "conf", [f"scene={scene_option(project / 'conf', scene)}", *selection.overrides])
-    swept = [f"{_HYDRA_SCENE_KEY}={','.join(names)}"] if names else []
-    return Axes(arguments=[*options, *swept, *items], jobs=tuple(jobs))
+    every = tuple(
+        Job(scene=scene, overrides=overrides)
+        for scene in (names or [None])
+        for overrides in itertools.product(*axes.values())
+    )
+    hydra = tuple(item for item in items if item not in axes)
+    return Axes(sweep=Sweep(hydra=hydra, jobs=every), folder=folder, jobs=tuple(jobs))
 
 
 def check_inputs(jobs: Sequence[Job], project: Path) -> None:
@@ -164,7 +242,7 @@ def check_inputs(jobs: Sequence[Job], project: Path) -> None:
             key = (scene, repr([composed[section] for section in CHECKED_SECTIONS]))
             if key not in seen:
                 seen.add(key)
-                _check(replace(selection, scenes=(scene,)), project, device=False)
+                _check(replace(selection, scenes=(scene,)), project, device=False, store=True)
 
 
 def _scene_names(item: str, project: Path) -> list[str]:
@@ -194,8 +272,8 @@ def _scene_names(item: str, project: Path) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _axes(items: Sequence[str], conf: Path) -> dict[str, list[str]]:
-    """Of every override the values that it stands for, each as Hydra would write it."""
+def _axes(items: Sequence[str], conf: Path) -> tuple[dict[str, list[str]], Path]:
+    """Of every override the values that it stands for, each as Hydra would write it; and the folder that Hydra would write to."""
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -229,6 +307,7 @@ def _axes(items: Sequence[str], conf: Path) -> dict[str, list[str]]:
                 OmegaConf.to_container(composed.hydra[key], resolve=False)
             if any("oc.env" in text for text in own):
                 raise ConfigError("would read an environment variable", where=item, fix="write the value itself")
+            folder = Path(composed.hydra.sweep.dir).absolute()
     except RecursionError:
         raise UserError("is nested too deeply", where=shorten(item)) from None
     # Beside its own errors, Hydra's parser lets those of very long and very large numbers through.
@@ -246,7 +325,7 @@ def _axes(items: Sequence[str], conf: Path) -> dict[str, list[str]]:
         fix = None if at_fault is None else _hydra_fix(at_fault, conf)
         where = shorten(at_fault or item) or "sceneexpander sweep"
         raise UserError(shorten(first.strip(), 200), where=where, fix=fix) from None
-    return found
+    return found, folder
 
 
 def _hydra_fix(item: str, conf: Path) -> str | None:
@@ -293,8 +372,8 @@ def _values(axis: Override, item: str) -> list[str]:
     return list(axis.sweep_string_iterator())
 
 
-def run_hydra(arguments: Sequence[str], project: Path) -> None:
-    """Hydra's command line over this project's ``conf/``.
+def run_hydra(numbers: Sequence[int], folder: Path, project: Path) -> None:
+    """Hydra's command line over this project's ``conf/``: its launcher runs the jobs of a sweep with these numbers.
 
     Raises:
         UserError: Hydra cannot start, e.g. because of the folder that it is to write to.
@@ -305,26 +384,100 @@ def run_hydra(arguments: Sequence[str], project: Path) -> None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    def run_one(_: Any) -> None:
-        settings = HydraConfig.get()
-        folder = Path(settings.runtime.output_dir)
-        given = {key_of(item): item for item in settings.overrides.task}
-        scene = given.pop(key_of(_HYDRA_SCENE_KEY), "").partition("=")[2] or None
-        job = Job(scene=scene, overrides=tuple(given.values()))
-        sweep = None if folder.parent == folder or settings.mode.name == "RUN" else "_".join(folder.parts[-3:-1])
-        run_job(folder, job, project, sweep=sweep)
-        print(f"{job.label()}: {folder / 'outputs' / 'report' / 'index.html'}")
+    sweep = Sweep.load(folder)
+
+    def run_one(settings: Any) -> None:
+        own = Path(HydraConfig.get().runtime.output_dir)
+        job = sweep.jobs[settings.swept_job]
+        run_job(own, job, project, sweep="_".join(own.parts[-3:-1]))
+        print(f"{job.label()}: {own / REPORT / 'index.html'}")
 
     # Otherwise Hydra prints errors in its own way and exits.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    sys.argv = [sys.argv[0], *arguments]
+    swept = f"{_JOB_KEY}={','.join(map(str, numbers))}"
+    place = [override("hydra.sweep.dir", str(folder)), "hydra.sweep.subdir=${swept_job}"]
+    given = [item for item in sweep.hydra if key_of(item) != "hydra.sweep.dir"]
+    sys.argv = [sys.argv[0], "--multirun", swept, *given, *place]
     try:
-        hydra.main(config_path=str(project / "conf"), config_name="config", version_base="1.3")(run_one)()
+        with _waiting_for_all():
+            hydra.main(config_path=str(project / "conf"), config_name="config", version_base="1.3")(run_one)()
     except (HydraException, OmegaConfBaseException, OSError) as error:
         if disk_full(error) is not None:
             raise
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         raise UserError(first.strip(), where="sceneexpander sweep") from None
+
+
+@contextlib.contextmanager
+def _waiting_for_all() -> Iterator[None]:
+    """Let Hydra's submitit launcher take a job that was killed for one that failed: it would not wait for those after it."""
+    try:
+        from submitit.core.core import Job as Submitted
+        from submitit.core.utils import UncompletedJobError
+    except ImportError:
+        yield
+        return
+    from hydra.core.utils import JobReturn, JobStatus
+
+    original = Submitted.results
+
+    def results(self: Any) -> Any:
+        try:
+            return original(self)
+        except UncompletedJobError as error:
+            return [JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError(str(error)))]
+
+    Submitted.results = results
+    try:
+        yield
+    finally:
+        Submitted.results = original
+
+
+def run_sweep(folder: Path, project: Path) -> int:
+    """Run what is missing in a sweep's folder, and say at the end what failed and how to have only that again.
+
+    Launchers end all their jobs when one of their processes is killed: those are started again as long as that gets any of them done.
+
+    Returns:
+        The exit code: 0 if every job is done.
+    """
+    sweep = Sweep.load(folder)
+    states = [job_state(folder, number) for number in range(len(sweep.jobs))]
+    missing = [number for number, state in enumerate(states) if not state.done]
+    for number in missing:
+        (folder / str(number) / STATE_FILE).unlink(missing_ok=True)
+    left, code = missing, 0
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("HYDRA_")}
+    while left:
+        # Jobs run in processes of their own, some of which Hydra's launchers do not end: they end with this one.
+        command = [sys.executable, "-c", _INNER, *map(str, left)]
+        own = environment | {INNER_ENV: str(folder), ROOT_ENV: str(project)}
+        code = run_group(command, cwd=Path.cwd(), env=own)
+        states = [job_state(folder, number) for number in range(len(sweep.jobs))]
+        before, left = left, [number for number in left if not (states[number].done or states[number].error)]
+        if code == EXIT_BAD_INPUT or len(left) == len(before):
+            break
+        if left:
+            print(f"note: {len(left)} jobs were cut off and are started again", file=sys.stderr)
+    missing = {number: _why_missing(state) for number, state in enumerate(states) if not state.done}
+    if len(states) > 1 and len(missing) < len(states):
+        jobs = [
+            SweptJob(label=job.label(), folder=str(number), error=missing.get(number, ""))
+            for number, job in enumerate(sweep.jobs)
+        ]
+        print(f"all jobs: {write_sweep_page(jobs, folder, pages=PAGES, report=REPORT)}")
+    if not missing:
+        return 0
+    print(f"error: {len(missing)} of {len(states)} jobs are not done:", file=sys.stderr)
+    for number, why in missing.items():
+        print(f"  {number} {sweep.jobs[number].label()}: {printable(why)}", file=sys.stderr)
+    print(f"again, only these: sceneexpander sweep --retry {shlex.quote(str(folder))}", file=sys.stderr)
+    return code or 1
+
+
+def _why_missing(state: JobState) -> str:
+    return state.error or ("was killed" if state.started else "was not started")
 
 
 def make_parser() -> CommandParser:
@@ -336,11 +489,13 @@ def make_parser() -> CommandParser:
             "--multirun ablation=baseline,paper seed=0,1,2",
             "--multirun 'scene=glob(*)' profile=smoke",
             "--multirun hydra/launcher=slurm 'ablation=glob(*)'",
+            "--retry multirun/2026-05-01/12-00-00",
         ],
     )
     parser.add_argument(
-        "axes", nargs="+", metavar="key=value,...", help="settings, with several values those to combine"
+        "axes", nargs="*", metavar="key=value,...", help="settings, with several values those to combine"
     )
+    parser.add_argument("--retry", metavar="FOLDER", help="instead: the jobs of an earlier sweep that are not done")
     parser.add_argument("-m", "--multirun", action="store_true", help="some settings have several values")
     return parser
 
@@ -353,9 +508,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         make_parser().print_help()
         return
     project = find_project()
-    if os.environ.pop(INNER_ENV, None):
+    inner = os.environ.pop(INNER_ENV, None)
+    if inner is not None:
         try:
-            run_hydra(given, project)
+            run_hydra([int(number) for number in given], Path(inner), project)
         except RuntimeError as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(1) from None
@@ -364,13 +520,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise UserError(
             "nothing to sweep over", where="sceneexpander sweep", fix="add --multirun ablation=baseline,paper"
         )
-    axes = check_axes(given, project)
-    check_inputs(axes.jobs, project)
-    # Jobs run in processes of their own, some of which Hydra's launchers do not end: they end with this one.
-    command = [sys.executable, "-m", "sceneexpander.sweep", *axes.arguments]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("HYDRA_")}
-    environment |= {INNER_ENV: "1", ROOT_ENV: str(project)}
-    raise SystemExit(run_group(command, cwd=Path.cwd(), env=environment))
+    if given[0] == "--retry":
+        if len(given) != 2:
+            raise UserError("takes one folder of a sweep and nothing else", where="--retry")
+        folder = Path(given[1]).absolute()
+        check_inputs(Sweep.load(folder).jobs, project)
+    else:
+        axes = check_axes(given, project)
+        check_inputs(axes.jobs, project)
+        folder = axes.folder
+        if (folder / SWEEP_FILE).exists() and Sweep.load(folder) != axes.sweep:
+            raise UserError("holds another sweep", where=folder, fix="choose another hydra.sweep.dir")
+        try:
+            write_json_atomic(folder / SWEEP_FILE, to_plain(axes.sweep))
+        except OSError as error:
+            raise UserError(str(error.strerror), where=folder) from None
+    raise SystemExit(run_sweep(folder, project))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from sceneexpander.pipeline.project import LIVE_FOLDER, find_project
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.describe import experiment_links
 from sceneexpander.tracking.follow import Follower
+from sceneexpander.tracking.server import SHELL_URI
 from sceneexpander.tracking.store import (
     database_path,
     last_experiment,
@@ -40,6 +41,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     port = make_parser().parse_args(arguments).port
     check_port(port)
     root = find_project()
+    if os.environ.get(SHELL_URI):
+        print(
+            f"note: {SHELL_URI} is set: runs go to that server, this shows those of the project folder", file=sys.stderr
+        )
     quiet_environment()
     set_damaged_aside(root)
     if not database_path(root).is_file():

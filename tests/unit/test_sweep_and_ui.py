@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import socket
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from sceneexpander import ablation, sweep, ui
+from sceneexpander.artifacts.store import to_plain, write_json_atomic
 from sceneexpander.errors import UserError
 from sceneexpander.expandbench.run import CellResult, Plan, Settings
 from sceneexpander.pipeline.selection import Selection
 from sceneexpander.sweep import check_axes, run_hydra
 
 ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def logging_as_before() -> Iterator[None]:
+    """Hydra sets logging up for a process of its own."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
 
 
 @pytest.mark.parametrize(
@@ -48,6 +61,7 @@ ROOT = Path(__file__).parents[2]
         (["--multirun", "scene="], "scene: there is no scene ''"),
         (["--multirun", "scene=courtyard", "scene=courtyard"], "scene: is given twice"),
         (["--multirun", "scene=range(1"], "scene: there is no scene 'range(1'"),
+        (["hydra.sweep.subdir=x"], "hydra.sweep.subdir=x: is decided by the sweep; leave it out"),
         (["seed=0,1"], "seed=0,1: holds several values; add --multirun"),
         (["seed=${oc.env:HOME}"], "environment variable"),
         (["hydra.run.dir=${oc.env:HOME}"], "environment variable"),
@@ -66,7 +80,9 @@ def test_good_axes_pass_as_they_are() -> None:
     if not (ROOT / "conf" / "hydra" / "launcher" / "parallel.yaml").is_file():
         given.pop()
     axes = check_axes(given, ROOT)
-    assert axes.arguments == given
+    assert axes.sweep.hydra == tuple(item for item in given if item.startswith("hydra"))
+    rows = {job.overrides[0] for job in axes.sweep.jobs}
+    assert len(axes.sweep.jobs) == len(set(axes.sweep.jobs)) == len(rows) * 2 * 3
     # The first of every axis together, then every other value once.
     assert {item for job in axes.jobs for item in job.overrides if item.startswith("seed")} == {"seed=0", "seed=1"}
     assert {job.scene for job in axes.jobs} == {None}
@@ -95,8 +111,9 @@ def test_scenes_are_an_axis(axis: str, expected: list[str], project: Path) -> No
     scenes_of(project, "a", "b", "c")
     axes = check_axes(["--multirun", axis, "ablation=paper,anchor"], project)
     assert list(dict.fromkeys(job.scene for job in axes.jobs)) == expected
-    assert f"+swept_scene={','.join(expected)}" in axes.arguments
-    assert axis not in axes.arguments
+    assert [(job.scene, job.overrides) for job in axes.sweep.jobs] == [
+        (scene, (f"ablation={row}",)) for scene in expected for row in ("paper", "anchor")
+    ]
 
 
 def test_every_scene_of_a_sweep_is_a_job_with_its_own_selection(
@@ -129,7 +146,10 @@ def test_every_scene_of_a_sweep_is_a_job_with_its_own_selection(
     assert [one["scene"] for one in checked] == ["a", "b"], (
         "settings that pictures and weights know nothing of are not read twice"
     )
-    run_hydra(axes.arguments, project)
+    assert axes.folder == tmp_path / "out"
+    write_json_atomic(axes.folder / "sweep.json", to_plain(axes.sweep))
+    run_hydra([0, 1, 2, 3], axes.folder, project)
+    assert all(sweep.job_state(axes.folder, number).done for number in range(4))
     assert [(one.scenes, one.overrides) for one in made] == [
         ((scene,), ("seed=7", f"adapt.steps={steps}")) for scene in "ab" for steps in (1, 2)
     ]
@@ -153,17 +173,21 @@ def test_weights_of_rivals_are_checked_before_any_job_runs(project: Path, tmp_pa
 def test_a_file_with_any_name_is_one_value(tmp_path: Path) -> None:
     path = tmp_path / "a, b.png"
     path.write_text("x")
-    items = check_axes(["generator=file", f"generator.file={path}"], ROOT).arguments
-    assert items[1] == f"generator.file='{path}'"
+    (job,) = check_axes(["generator=file", f"generator.file={path}"], ROOT).sweep.jobs
+    assert job.overrides == ("generator=file", f"generator.file='{path}'")
 
 
-def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_made_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(sys, "argv", ["sweep"])
-    monkeypatch.setattr(sweep, "run_job", lambda *_, **__: None)
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sweep, "check_inputs", lambda *_, **__: None)
+    monkeypatch.setenv("SCENEEXPANDER_ROOT", str(ROOT))
     (tmp_path / "file").write_text("x")
-    with pytest.raises(UserError, match="sceneexpander sweep"):
-        run_hydra([f"hydra.run.dir={tmp_path / 'file' / 'x'}"], ROOT)
+    with pytest.raises(SystemExit) as caught:
+        sweep.main(["seed=1", f"hydra.sweep.dir={tmp_path / 'file' / 'x'}"])
+    assert caught.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.fixture

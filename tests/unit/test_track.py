@@ -11,10 +11,12 @@ from typing import Any
 
 import pytest
 
+from sceneexpander.artifacts.store import to_plain
 from sceneexpander.errors import UserError
-from sceneexpander.pipeline.recording import RECORDED, ask_for_recording
+from sceneexpander.pipeline.recording import RECORDED, Recorded, RecordedScene, ask_for_recording
 from sceneexpander.tracking import TrackingConfig
-from stages import track
+from sceneexpander.tracking.store import database_path
+from stages import layout, track
 
 ROOT = Path(__file__).parents[2]
 
@@ -42,6 +44,7 @@ def test_what_goes_wrong_there_is_one_warning(
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "params.yaml").write_text((ROOT / "params.yaml").read_text())
+    (tmp_path / layout.PAGES / "courtyard").mkdir(parents=True)
     monkeypatch.setattr(track, "record_runs", fail)
     monkeypatch.setattr(track, "scene_runs", lambda *_, **__: [])
     monkeypatch.setattr(track, "read_sections", lambda *_: track.Sections(tracking=TrackingConfig()))
@@ -50,38 +53,71 @@ def test_what_goes_wrong_there_is_one_warning(
     (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert said in line
     assert "second" not in line
-    assert json.loads(track.MARKER.read_text()) == {"courtyard": None}
+    (scene,) = json.loads(RECORDED.read_text())["scenes"].values()
+    assert scene["runs"] is None
     ask_for_recording()
-    assert not track.MARKER.exists(), "the next start records"
+    assert not RECORDED.exists(), "the next start records"
 
 
-def test_recorded_runs_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def leave_recorded(uri: str, store: str) -> None:
+    RECORDED.parent.mkdir(exist_ok=True)
+    scene = RecordedScene(configured=uri, store=store, runs=("key",))
+    RECORDED.write_text(json.dumps(to_plain(Recorded(scenes={"room": scene}))))
+    database_path(Path()).write_text("a database")
+
+
+SERVER, OTHER = "http://host:5000", "http://other:5000"
+
+
+@pytest.mark.parametrize(
+    ("uri", "store", "shell", "kept"),
+    [
+        ("local", "local", None, True),
+        ("local", "local", "", True),
+        ("local", "local", SERVER, False),
+        ("local", SERVER, SERVER, True),
+        ("local", SERVER, SERVER.replace("//", "//me:secret@"), True),
+        ("local", SERVER, OTHER, False),
+        ("local", SERVER, None, False),
+        (SERVER, SERVER, OTHER, True),
+        ("off", "off", OTHER, True),
+        ("local", "local", "./mlruns", False),
+    ],
+)
+def test_runs_are_recorded_again_where_they_go_today(
+    uri: str, store: str, shell: str | None, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SCENEEXPANDER_ROOT", raising=False)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    if shell is not None:
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", shell)
+    leave_recorded(uri, store)
+    ask_for_recording()
+    assert RECORDED.exists() == kept
+
+
+def test_what_an_earlier_version_noted_is_looked_at_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     ask_for_recording()
     for content in ('{"a": ["key"], "b": []}', "[]", "not JSON"):
         RECORDED.parent.mkdir(exist_ok=True)
         RECORDED.write_text(content)
         ask_for_recording()
-        assert RECORDED.read_text() == content
-    assert track.MARKER == RECORDED
+        assert not RECORDED.exists()
 
 
-@pytest.mark.parametrize(("uri", "kept"), [("local", False), ("off", True), ("http://host:5000", True)])
+@pytest.mark.parametrize(("uri", "kept"), [("local", False), ("off", True), (SERVER, True)])
 def test_a_lost_local_database_is_filled_again(
     uri: str, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("SCENEEXPANDER_ROOT", raising=False)
-    for path, text in (
-        (RECORDED, '{"room": ["key"]}'),
-        (Path("outputs/room/config.yaml"), f"tracking: {{uri: '{uri}', experiment: e}}"),
-        (Path("mlflow/mlflow.db"), "a database"),
-    ):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    leave_recorded(uri, uri)
     ask_for_recording()
     assert RECORDED.exists(), "the runs are there"
-    Path("mlflow/mlflow.db").unlink()
+    database_path(Path()).unlink()
     ask_for_recording()
     assert RECORDED.exists() == kept
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path, PurePosixPath
@@ -49,6 +49,11 @@ class DeclaredStage:
     dependencies: tuple[str, ...]
     parameters: Mapping[str, tuple[str, ...]]
     outputs: tuple[Output, ...]
+
+    @property
+    def gathers(self) -> bool:
+        """Whether it is one stage for all scenes: it goes on with those that are there."""
+        return "@" not in self.address
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -111,6 +116,18 @@ def find_predecessors(stages: Sequence[DeclaredStage]) -> dict[str, list[str]]:
             before |= {makers[part] for part in (path, *path.parents) if part in makers}
         found[stage.address] = [other.address for other in stages if other.address in before - {stage.address}]
     return found
+
+
+def find_stale(stages: Sequence[DeclaredStage], left_out: Collection[str]) -> list[str]:
+    """Outputs of an earlier run that stages for all scenes would gather although what makes them has failed or was left out."""
+    gathered = [PurePosixPath(path) for stage in stages if stage.gathers for path in stage.reads]
+    return [
+        output.path
+        for stage in stages
+        if stage.address in left_out and not stage.gathers
+        for output in stage.outputs
+        if any(path in (PurePosixPath(output.path), *PurePosixPath(output.path).parents) for path in gathered)
+    ]
 
 
 def _sort(stages: Sequence[DeclaredStage]) -> Iterator[DeclaredStage]:

@@ -30,6 +30,7 @@ from sceneexpander.errors import EXIT_BAD_INPUT, UserError, entry_point, printab
 from sceneexpander.pipeline.declared import (
     DeclaredStage,
     find_predecessors,
+    find_stale,
     read_pipeline,
     select_stages,
 )
@@ -39,6 +40,7 @@ from sceneexpander.pipeline.processes import ended_by_signals, kept
 from sceneexpander.pipeline.project import find_project
 from sceneexpander.pipeline.recording import ask_for_recording
 from sceneexpander.pipeline.surroundings import pipeline_environment
+from sceneexpander.pipeline.unasked import answer_unasked
 
 STATE = Path(".cache") / "run" / "state.json"
 _SCHEMA = "run/1"
@@ -120,10 +122,12 @@ class PlainRunner:
         self.failed: dict[str, int] = {}
         self.left_out: list[str] = []
         self.ran: list[str] = []
+        self._stages: Sequence[DeclaredStage] = ()
         self._parameter_files: dict[tuple[str, str], Any] = {}
 
     def run(self, stages: Sequence[DeclaredStage]) -> None:
         """Run what has changed. What failed, and what was left out because of it, is in `failed` and `left_out`."""
+        self._stages = stages
         before = {address: set(found) for address, found in find_predecessors(stages).items()}
         waiting = {stage.address: stage for stage in stages}
         done: set[str] = set()
@@ -136,7 +140,7 @@ class PlainRunner:
                         if self._can_run(stage, before[stage.address]):
                             running[pool.submit(self._bring_up_to_date, stage)] = stage
                         else:
-                            self.left_out.append(stage.address)
+                            self._leave_out(stage)
                             done.add(stage.address)
                 if not running:
                     if not self._may_start():
@@ -148,6 +152,7 @@ class PlainRunner:
                     code = future.result()
                     if code:
                         self.failed[stage.address] = code
+                        self._remove_stale(stage)
                     done.add(stage.address)
                     self._save()
 
@@ -173,7 +178,15 @@ class PlainRunner:
         lost = before & {*self.failed, *self.left_out}
         if not lost:
             return True
-        return "@" not in stage.address and all((self.folder / path).exists() for path in stage.reads)
+        return stage.gathers and all((self.folder / path).exists() for path in stage.reads)
+
+    def _leave_out(self, stage: DeclaredStage) -> None:
+        self.left_out.append(stage.address)
+        self._remove_stale(stage)
+
+    def _remove_stale(self, stage: DeclaredStage) -> None:
+        for path in find_stale(self._stages, {stage.address}):
+            remove_tree(self.folder / path)
 
     def _bring_up_to_date(self, stage: DeclaredStage) -> int | None:
         if self.is_up_to_date(stage):
@@ -192,10 +205,13 @@ class PlainRunner:
         command = [sys.executable if program == "python" else program, *arguments]
         environment = pipeline_environment(self.folder, self.folder) | {"DVC_STAGE": stage.address}
         started = time.monotonic()
-        with kept(command, cwd=self.folder, env=environment, held=self.held) as process:
-            self._processes.add(process)
-            code = process.wait()
-            self._processes.discard(process)
+        code = 0
+        made = [self.folder / output.path for output in stage.outputs]
+        if not answer_unasked({self.folder / file: keys for file, keys in stage.parameters.items()}, made):
+            with kept(command, cwd=self.folder, env=environment, held=self.held) as process:
+                self._processes.add(process)
+                code = process.wait()
+                self._processes.discard(process)
         missing = [output.path for output in stage.outputs if not (self.folder / output.path).exists()]
         if code or missing:
             return code or 1

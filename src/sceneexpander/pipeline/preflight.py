@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -20,6 +21,8 @@ from sceneexpander.judge import make_judge
 from sceneexpander.models.weights import HUB_ID
 from sceneexpander.pipeline.project import GENERATED_FOLDER, JUDGED_FOLDER, find_project
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model
+from sceneexpander.tracking.config import TrackingConfig
+from sceneexpander.tracking.server import require_server, where_runs_go
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +39,7 @@ class Checked:
 
     weights: set[ModelConfig] = field(default_factory=set)
     pictures: dict[Hashable, CheckedScene] = field(default_factory=dict)
+    stores: set[TrackingConfig] = field(default_factory=set)
 
 
 CHECKED_SECTIONS = (
@@ -59,6 +63,7 @@ def check_scene(
     round_overrides: Sequence[Sequence[str]] = (),
     methods: Sequence[str] = (),
     device: bool = True,
+    store: bool = True,
     checked: Checked | None = None,
 ) -> CheckedScene:
     """Compose the configuration for a scene and read all of its pictures; nothing is written, and no request is sent.
@@ -72,6 +77,7 @@ def check_scene(
         round_overrides: further ones of each round, as far as it has any.
         methods: that are to run; reconstructors of others among them that have no weights will say so in their rows.
         device: whether the device must be there; not on a machine that only hands jobs to others.
+        store: whether MLflow's server must be there, if runs go to one; not for a job that waited long: recording is made up for later.
         checked: of the same command's earlier calls; weights are loaded and pictures decoded once.
 
     Raises:
@@ -90,6 +96,10 @@ def check_scene(
     if judge is not None:
         judge.require()
     checked = Checked() if checked is None else checked
+    tracking = where_runs_go(config.tracking, os.environ)
+    if store and tracking not in checked.stores:
+        require_server(tracking)
+        checked.stores.add(tracking)
     obtained = tuple((number, repr(item.generator), item.choose) for number, item in {0: config, **own}.items())
     pictures = folder, config.scene, obtained, rounds
     if pictures not in checked.pictures:

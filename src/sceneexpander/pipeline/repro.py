@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 
 from sceneexpander.errors import entry_point
+from sceneexpander.pipeline.__main__ import AGAIN_ENV
 from sceneexpander.pipeline.disk import require_room
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.processes import run_group
@@ -25,12 +26,12 @@ def main() -> None:
         code = run_group(
             [sys.executable, "-m", "sceneexpander.pipeline", *sys.argv[1:]],
             cwd=project,
-            env=pipeline_environment(project, project),
+            env=pipeline_environment(project, project) | {AGAIN_ENV: "make repro"},
             held=(lock.descriptor,),
         )
     if code:
         require_room(project)
-        print(f"error: the pipeline failed (exit code {code}); its last lines say where", file=sys.stderr)
+        print(f"error: the pipeline is not up to date (exit code {code}); the lines above say why", file=sys.stderr)
         raise SystemExit(1)
 
 

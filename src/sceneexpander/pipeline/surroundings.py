@@ -1,8 +1,8 @@
 """What a pipeline run takes from the user's shell, and what not: the same command makes the same run on every desk.
 
 Decided variable by variable. What names the user's machine stays (PATH, HOME, TMPDIR, CUDA_*, OMP_*, proxies, keys that a setting
-names). What would quietly turn a run into another one is left out: settings of Hydra, DVC and MLflow that `conf/` and `.dvc/` decide,
-where Python looks for modules, where git looks for its repository, and a login shell that may be no shell.
+names, the server of MLflow). What would quietly turn a run into another one is left out: settings of Hydra, DVC and MLflow that `conf/`
+and `.dvc/` decide, where Python looks for modules, where git looks for its repository, and a login shell that may be no shell.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from configobj import ConfigObj, ConfigObjError
 from sceneexpander.errors import UserError
 from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.project import ERROR_FILE_ENV, ROOT_ENV
+from sceneexpander.tracking.server import SHELL_URI
 from sceneexpander.tracking.store import without_foreign_settings
 
 _LEFT_OUT = ("HYDRA_", "DVC_", "PYTHON", "GIT_")
@@ -35,7 +36,8 @@ def pipeline_environment(folder: Path, project: Path, *, error_file: Path | None
         error_file: where a stage that refuses its input leaves the line; None: nowhere.
     """
     environment = {name: value for name, value in os.environ.items() if name in _KEPT or not name.startswith(_LEFT_OUT)}
-    environment = without_foreign_settings(environment)
+    server = {name: value for name, value in environment.items() if name == SHELL_URI}  # for the last stage to look at
+    environment = without_foreign_settings(environment) | server
     # Within a path the separator cannot be written; commands start in the folder, so its relative name does as well.
     places = ["src", "."] if os.pathsep in str(folder) else [str(folder / "src"), str(folder)]
     environment |= {

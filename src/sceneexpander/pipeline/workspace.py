@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sceneexpander.config.overrides import key_of, written_out
-from sceneexpander.errors import UserError, interruptible, printable
+from sceneexpander.errors import UserError, interruptible
 from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.disk import make_writable, remove_tree, require_room
 from sceneexpander.pipeline.locks import RunLock, file_lock
@@ -26,7 +26,6 @@ from sceneexpander.pipeline.processes import ended_by_signals, kept
 from sceneexpander.pipeline.project import SWEEP_ENV, find_project
 from sceneexpander.pipeline.selection import PARAMS, Selection
 from sceneexpander.pipeline.surroundings import LOCAL_CONFIG, local_config, pipeline_environment
-from sceneexpander.tracking.store import ignored_note
 
 COPIED_FOLDERS = ("conf", "src", "stages")
 COPIED_FILES = ("dvc.yaml", ".dvcignore", "pyproject.toml", *LOCKS, ".dvc/config")
@@ -139,9 +138,6 @@ def reproduce_shared(folder: Path, *, project: Path, sweep: str | None = None) -
 
 def _run(arguments: Sequence[str], folder: Path, environment: Mapping[str, str], lock: RunLock | None) -> None:
     (folder / ERROR_FILE).unlink(missing_ok=True)
-    note = ignored_note(os.environ)
-    if note is not None:
-        print(f"note: {printable(note)}", file=sys.stderr)
     command = [sys.executable, *arguments]
     held = () if lock is None else (lock.descriptor,)
     with ended_by_signals(), kept(command, cwd=folder, env=environment, held=held) as process:

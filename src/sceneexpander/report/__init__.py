@@ -1,6 +1,6 @@
-"""The page to look at."""
+"""The pages to look at."""
 
 from sceneexpander.report.collect import MethodSource, RoundSource, SceneSource, collect_scene
-from sceneexpander.report.page import write_page
+from sceneexpander.report.site import write_page
 
 __all__ = ["MethodSource", "RoundSource", "SceneSource", "collect_scene", "write_page"]

@@ -1,10 +1,8 @@
-"""One static page from the gathered scenes: no server, no network, no build step."""
+"""What the page of one scene is filled with."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -12,52 +10,37 @@ from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
 from sceneexpander.artifacts.page import MethodPage, RoundPage, ScenePage, StageRun
 from sceneexpander.catalogue import ARROWS, MAIN, Metric
 from sceneexpander.catalogue.methods import CAPTURED, known_method
-from sceneexpander.files import write_bytes_atomic
 from sceneexpander.report.cameras import cameras_shown
 from sceneexpander.report.course import FITTED, fits, looks_shown, verdict
 from sceneexpander.report.curve import curve_chart, objective_curves, smoothing_window
 from sceneexpander.report.judged import load_judged, page_table
+from sceneexpander.report.media import poster_of
 from sceneexpander.report.rounds import RoundsShown, rounds_shown
 from sceneexpander.report.words import LAYERS, PICTURE_KINDS, method_label, number_tables
 
 _Filled = dict[str, Any]  # what a part of the template is filled with
 
 
-def write_page(scenes: Sequence[Path], folder: Path) -> None:
-    """Fill ``folder`` with ``index.html`` and ``media/<scene>/``.
+def fill_scene(page: ScenePage, folder: Path, *, media: str, walks: bool) -> _Filled:
+    """What the template ``page.html.j2`` knows of a scene.
 
     Args:
-        scenes: folders made by `collect_scene`, in the order of the page.
-        folder: an existing (scratch) folder.
+        page: of the scene, with the names that its files have under ``media``.
+        folder: made by `collect_scene`.
+        media: where its files are, relative to the page.
+        walks: whether the pages to walk through are there.
     """
-    import jinja2
-
-    for scene in scenes:
-        shutil.copytree(scene, folder / "media" / scene.name)
-    templates = files("sceneexpander.report") / "templates"
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string((templates / "page.html.j2").read_text(encoding="utf-8"))
-    from markupsafe import Markup
-
-    # Only these two texts, which ship with the package, go in as they are.
-    css, js = (Markup((templates / name).read_text(encoding="utf-8")) for name in ("page.css", "page.js"))  # noqa: S704
-    html = template.render(
-        scenes=[_scene(ScenePage.load(scene), scene) for scene in scenes], layers=LAYERS, css=css, js=js
-    )
-    write_bytes_atomic(folder / "index.html", html.encode())
-
-
-def _scene(page: ScenePage, folder: Path) -> _Filled:
+    course = course_of(page, folder)
     return {
         "scene": page.scene,
         "anchor": folder.name,
-        "media": f"media/{folder.name}",
+        "media": media,
+        "walks": walks,
+        "timeline": timeline(page, course),
         "captured": page.captured,
         "cameras": cameras_shown(page.cameras, _pictures(page)),
         "rounds": [_round(item, page, folder) for item in page.rounds],
-        "course": _course(page, folder),
+        "course": course,
         "proposals": page.rounds[-1].proposals if page.rounds else None,
         "facts": _facts(page),
         "timings": _timings(page),
@@ -65,7 +48,21 @@ def _scene(page: ScenePage, folder: Path) -> _Filled:
     }
 
 
-def _course(page: ScenePage, folder: Path) -> RoundsShown | None:
+def timeline(page: ScenePage, course: RoundsShown | None) -> list[_Filled]:
+    """The rounds in order: sentence, inserted picture, and the drift of earlier views."""
+    drifts = {row.label: row.drift for row in course.rows} if course is not None else {}
+    return [
+        {
+            "number": item.number,
+            "prompt": item.prompt,
+            "picture": item.inserted,
+            "drift": drifts.get(f"round {item.number}", ""),
+        }
+        for item in page.rounds
+    ]
+
+
+def course_of(page: ScenePage, folder: Path) -> RoundsShown | None:
     """What became of all regions over the rounds; None without more than one of them."""
 
     def row_of(item: RoundPage, name: str) -> MetricsRow | None:
@@ -92,6 +89,7 @@ def _round(page: RoundPage, scene: ScenePage, folder: Path) -> _Filled:
         "misalignment": page.misalignment,
         "sheet": page.sheet if page.candidates > 1 else None,
         "methods": [_shown_method(method, labels[method.name]) for method in page.methods],
+        "layers": [item for item in LAYERS if any(item[0] in method.videos for method in page.methods)],
         "main": MAIN,
         "cameras": cameras_shown(page.cameras, _pictures(scene)),
         "tables": [
@@ -117,12 +115,11 @@ def _round(page: RoundPage, scene: ScenePage, folder: Path) -> _Filled:
 
 def _shown_method(method: MethodPage, label: str) -> _Filled:
     known = known_method(method.name)
-    poster = max(method.stills, key=lambda still: -abs(still.frame - method.inserted_frame))
     return {
         "page": method,
         "label": label,
         "short": "" if known is None else known.short,
-        "poster": poster.pictures["rgb"],
+        "poster": poster_of(method),
         "goal": method.inserted_frame / max(method.frames, 1),
     }
 

@@ -166,7 +166,18 @@ def describe_experiment(client: Any, experiment: str) -> None:
         wanted[KIND_TAG] = "custom_model_development"  # MLflow shows runs first, not traces of language models
     for key, value in wanted.items():
         if tags.get(key) != value:
-            client.set_experiment_tag(experiment, key, value)
+            _set_tag(client, experiment, key, value)
+
+
+def _set_tag(client: Any, experiment: str, key: str, value: str) -> None:
+    """Set a tag that another machine may be setting at the same moment: a server with PostgreSQL refuses the second one."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        client.set_experiment_tag(experiment, key, value)
+    except MlflowException:
+        if client.get_experiment(experiment).tags.get(key) != value:
+            raise
 
 
 def _hash(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -16,6 +17,9 @@ from sceneexpander.tracking.describe import CAMERAS_TAG, LEFT_OUT_TAG, NOTE_TAG,
 from sceneexpander.tracking.record import RunRecord, run_key
 from sceneexpander.tracking.store import LIVE_TAG
 from sceneexpander.tracking.tracked import tracked_cost, tracked_look, tracked_row, tracked_step
+
+_COMPARED_PHOTOS = 3
+_NO_NAME = re.compile(r"[^A-Za-z0-9_. -]")  # what MLflow takes in no name of a picture
 
 
 def variant_name(overrides: Sequence[str]) -> str:
@@ -68,6 +72,7 @@ def _run(
         metrics=tracked_row(row) | tracked_cost({stage.partition("-")[0]: run for stage, run in stages.items()}),
         curves=_curves(item) if adapted else {},
         artefacts=_artefacts(item, method, folder, extra) | (_look_pictures(item, folder) if adapted else {}),
+        pictures=_compared_pictures(item, method, folder, adapted=adapted),
         tags={
             "scene": scene,
             "round": str(number),
@@ -112,6 +117,31 @@ def _curves(item: RoundPage) -> dict[str, list[tuple[int, float]]]:
 def _look_pictures(item: RoundPage, folder: Path) -> dict[str, Path]:
     looks = item.looks.looks if item.looks else ()
     return {f"looks/{Path(path).name}": folder / path for look in looks for path in look.pictures.values()}
+
+
+def _compared_pictures(
+    item: RoundPage, method: MethodPage, folder: Path, *, adapted: bool
+) -> dict[str, list[tuple[int, Path]]]:
+    """What to look at side by side: the still nearest to the inserted view, some views at their own cameras, the looks of an adaptation."""
+    still = min(method.stills, key=lambda still: abs(still.frame - method.inserted_frame))
+    shown = [view.view_id for view in method.views if view.view_id in method.view_pictures]
+    looks = item.looks.looks if adapted and item.looks else ()
+    found = {
+        "near the inserted view": [(0, still.pictures["rgb"])],
+        **{
+            view: [(0, method.view_pictures[view])]
+            for place, view in enumerate(shown)
+            if place < _COMPARED_PHOTOS or view == item.inserted_id
+        },
+        "inserted view while adapting": [
+            (look.step, look.pictures["inserted"]) for look in looks if "inserted" in look.pictures
+        ],
+    }
+    return {
+        f"0_pictures/{_NO_NAME.sub('_', name)}": [(step, folder / place) for step, place in shots]
+        for name, shots in found.items()
+        if shots
+    }
 
 
 def _unavailable(page: ScenePage, item: RoundPage, method: MissingMethod, folder: Path, commit: str) -> RunRecord:

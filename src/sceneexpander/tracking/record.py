@@ -20,6 +20,7 @@ class RunRecord:
         metrics: final numbers.
         curves: (step, value), in ascending order.
         artefacts: files by their path in the run; pictures are shown by the interface as such.
+        pictures: by a name for people, (step, file): MLflow shows those of several runs side by side, with a slider for the step.
         tags: facts to filter by.
         started_ms: epoch milliseconds of the work itself (not of the recording), so that repeating the recording gives the same run.
         duration_ms: of the work.
@@ -31,6 +32,7 @@ class RunRecord:
     metrics: Mapping[str, float]
     curves: Mapping[str, Sequence[tuple[int, float]]] = field(default_factory=dict)
     artefacts: Mapping[str, Path] = field(default_factory=dict)
+    pictures: Mapping[str, Sequence[tuple[int, Path]]] = field(default_factory=dict)
     tags: Mapping[str, str] = field(default_factory=dict)
     started_ms: int = 0
     duration_ms: int = 0

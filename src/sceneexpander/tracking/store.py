@@ -18,12 +18,15 @@ from sceneexpander.errors import UserError
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.describe import describe_experiment
 from sceneexpander.tracking.record import RunRecord
+from sceneexpander.tracking.server import SHELL_URI, shown
 
 _log = logging.getLogger(__name__)
 
 KEY_TAG = "run_key"
 LIVE_TAG = "adaptation"  # identity of the adaptation that a run mirrors or holds, see `sceneexpander.tracking.follow`
 COMPLETE_TAG = "complete"  # set last: a recording that was killed half-way is done again
+_BEGUN_TAG = "recording"  # when the recording began, in seconds since the epoch: of a half-recorded run, whether someone is still at it
+_ABANDONED_S = 1800.0
 NAMES = (
     "3"  # its value: the scheme of the metrics' names; a run that has other names gives way when it is recorded again
 )
@@ -34,7 +37,7 @@ _PARAM_LENGTH = 6000
 
 # Of MLflow's variables those that say how to reach a server, not which one or what to record.
 _SERVER_SETTINGS = ("MLFLOW_TRACKING_", "MLFLOW_HTTP_REQUEST_", "MLFLOW_S3_", "MLFLOW_GCS_")
-_DECIDED = frozenset({"MLFLOW_TRACKING_URI"})  # by tracking.uri
+_DECIDED = frozenset({SHELL_URI})  # see `sceneexpander.tracking.server`
 _OURS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
@@ -46,7 +49,8 @@ _BUSY = ("already exists", "database is locked", "is locked", "no such table")
 def without_foreign_settings(environment: Mapping[str, str]) -> dict[str, str]:
     """The variables of a shell without those that would send runs elsewhere or set MLflow up in another way.
 
-    Where runs go is said by ``tracking.uri`` alone. Names and passwords for a server stay.
+    Where runs go is said by the settings and, by `sceneexpander.tracking.server`, by ``MLFLOW_TRACKING_URI``: MLflow itself need not
+    see it. Names and passwords for a server stay.
     """
     kept = {
         name: value
@@ -58,17 +62,8 @@ def without_foreign_settings(environment: Mapping[str, str]) -> dict[str, str]:
     return kept | _OURS
 
 
-def ignored_note(environment: Mapping[str, str]) -> str | None:
-    """What to tell a user whose shell names a store for runs; None if it names none."""
-    named = environment.get("MLFLOW_TRACKING_URI")
-    return None if named is None else f"MLFLOW_TRACKING_URI={named} is ignored: tracking.uri says where runs go"
-
-
 def quiet_environment() -> None:
-    """No telemetry, no background job machinery, and no store from the user's shell; must run before MLflow is imported."""
-    note = ignored_note(os.environ)
-    if note is not None:
-        _log.warning("%s", note)
+    """No telemetry, no background job machinery, and nothing else of the user's shell; must run before MLflow is imported."""
     wanted = without_foreign_settings(os.environ)
     for name in set(os.environ) - set(wanted):
         del os.environ[name]
@@ -157,15 +152,18 @@ def record_runs(
             return 0, len(records)
         client, experiment = open_store(config, root)
         describe_experiment(client, experiment)
-        known |= _complete(client, experiment, {record.key for record in records})
+        alone = config.uri == "local"
+        known |= _complete(client, experiment, {record.key for record in records}, alone=alone)
         missing = [record for record in records if record.key not in known]
         for record in missing:
             known[record.key] = _record(client, experiment, record)
+            if not alone:
+                known[record.key] = _keep_one(client, experiment, record.key)
             _remove_mirrored(client, experiment, record)
         if sweep is not None:
             for record in records:
-                client.set_tag(known[record.key], f"sweep.{sweep}", "1")
-    _log.info("recorded %d of %d runs", len(missing), len(records))
+                _set_tag(client, experiment, record.key, known[record.key], f"sweep.{sweep}")
+    _log.info("recorded %d of %d runs (%s)", len(missing), len(records), shown(config.uri))
     return len(missing), len(records) - len(missing)
 
 
@@ -206,7 +204,7 @@ def open_store(config: TrackingConfig, root: Path) -> tuple[Any, str]:
                 # Others may be writing the first tables just now, e.g. an `mlflow ui` that nobody can ask to wait.
                 first = str(error).strip().partition("\n")[0] or type(error).__name__
                 if attempt == _ATTEMPTS - 1 or not any(text in str(error) for text in _BUSY):
-                    raise UserError(f"cannot be used ({first})", where=f"tracking.uri {config.uri}") from None
+                    raise UserError(f"cannot be used ({first})", where=f"tracking.uri {shown(config.uri)}") from None
                 time.sleep(0.1 * 2**attempt)
     raise AssertionError("the last attempt returns or raises")
 
@@ -270,8 +268,11 @@ def describe_experiments(config: TrackingConfig, root: Path) -> None:
         describe_experiment(client, experiment)
 
 
-def _complete(client: Any, experiment: str, wanted: Collection[str]) -> dict[str, str]:
-    """Run ids by key. Half-recorded runs are deleted on the way, and those of ``wanted`` that have the names of an earlier version."""
+def _complete(client: Any, experiment: str, wanted: Collection[str], *, alone: bool) -> dict[str, str]:
+    """Run ids by key. Half-recorded runs are deleted on the way, and those of ``wanted`` that have the names of an earlier version.
+
+    ``alone``: nobody else can be recording at this moment. Elsewhere a half-recorded run may be another machine's work.
+    """
     found: dict[str, str] = {}
     token = None
     while True:
@@ -281,11 +282,48 @@ def _complete(client: Any, experiment: str, wanted: Collection[str]) -> dict[str
             names = run.data.tags.get(COMPLETE_TAG)
             if key is not None and names == NAMES:
                 found[key] = run.info.run_id
-            elif key is not None and (names is None or key in wanted):
-                client.delete_run(run.info.run_id)
+            elif key is not None and (_is_abandoned(run, alone) if names is None else key in wanted):
+                _delete(client, run.info.run_id)
         token = page.token
         if not token:
             return found
+
+
+def _is_abandoned(run: Any, alone: bool) -> bool:
+    return alone or time.time() - float(run.data.tags.get(_BEGUN_TAG, 0.0)) > _ABANDONED_S
+
+
+def _keep_one(client: Any, experiment: str, key: str) -> str:
+    """Id of the one run with this key that stays, if several machines have recorded it at once: all of them choose the same."""
+    runs = client.search_runs([experiment], f"tags.{KEY_TAG} = '{key}' and tags.{COMPLETE_TAG} = '{NAMES}'")
+    kept, *others = sorted(runs, key=lambda run: run.info.run_id)
+    for run in others:
+        _delete(client, run.info.run_id)
+        # Read after it is gone: from then on others mark the one that stays.
+        for tag in client.get_run(run.info.run_id).data.tags:
+            if tag.startswith("sweep."):
+                client.set_tag(kept.info.run_id, tag, "1")
+    return str(kept.info.run_id)
+
+
+def _set_tag(client: Any, experiment: str, key: str, run_id: str, tag: str) -> None:
+    from mlflow.exceptions import MlflowException
+
+    try:
+        client.set_tag(run_id, tag, "1")
+    except MlflowException:  # another machine has recorded the same meanwhile, and taken this one away
+        client.set_tag(_keep_one(client, experiment, key), tag, "1")
+
+
+def _delete(client: Any, run_id: str) -> None:
+    """Delete a run that another machine may be deleting as well."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        client.delete_run(run_id)
+    except MlflowException:
+        if client.get_run(run_id).info.lifecycle_stage != "deleted":
+            raise
 
 
 def _remove_mirrored(client: Any, experiment: str, record: RunRecord) -> None:
@@ -300,8 +338,9 @@ def _remove_mirrored(client: Any, experiment: str, record: RunRecord) -> None:
 
 def _record(client: Any, experiment: str, record: RunRecord) -> str:
     from mlflow.entities import Metric, Param
+    from PIL import Image
 
-    tags = {**record.tags, KEY_TAG: record.key, "mlflow.runName": record.name}
+    tags = {**record.tags, KEY_TAG: record.key, _BEGUN_TAG: str(int(time.time())), "mlflow.runName": record.name}
     run = client.create_run(experiment, start_time=record.started_ms, tags=tags, run_name=record.name)
     run_id = str(run.info.run_id)
     params = [Param(key, str(value)[:_PARAM_LENGTH]) for key, value in sorted(record.params.items())]
@@ -318,6 +357,10 @@ def _record(client: Any, experiment: str, record: RunRecord) -> str:
     for place, path in sorted(record.artefacts.items()):
         folder, _, _ = place.rpartition("/")
         client.log_artifact(run_id, str(path), folder or None)
+    for name, shots in sorted(record.pictures.items()):
+        for step, path in shots:
+            with Image.open(path) as picture:
+                client.log_image(run_id, picture.convert("RGB"), key=name, step=step, synchronous=True)
     client.set_terminated(run_id, end_time=end)
     client.set_tag(run_id, COMPLETE_TAG, NAMES)
     return run_id

@@ -98,9 +98,11 @@ def test_each_kind_of_change_counts_and_nothing_else(folder: Path) -> None:
 
 
 def test_a_scene_that_fails_does_not_stop_the_others(folder: Path) -> None:
+    assert ran(folder) == ALL
     (folder / "in" / "a").write_text("2")
     runner = PlainRunner(folder)
     runner.run(read_pipeline(folder))
+    assert not (folder / "made" / "a-1").exists(), "what an earlier run made of it is not shown as this one's"
     assert runner.failed == {"first@a": 2}
     assert runner.left_out == ["second@a-round0"]
     assert "b-1" in (folder / "all").read_text()

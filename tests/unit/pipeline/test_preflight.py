@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+import socket
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,22 @@ def test_a_device_is_there(device: str, count: int, fine: bool, monkeypatch: pyt
     else:
         with pytest.raises(UserError, match=rf"^device: is '{device}'"):
             check_device(device)
+
+
+@pytest.mark.parametrize("by_shell", [False, True])
+def test_a_server_for_runs_is_there_before_anything_is_read(
+    by_shell: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # and does not listen
+        uri = f"http://127.0.0.1:{nobody.getsockname()[1]}"
+        overrides = [] if by_shell else ["tracking=server", f"tracking.uri={uri}"]
+        if by_shell:
+            monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+        with pytest.raises(UserError, match=rf"^tracking\.uri {uri}: does not answer"):
+            check_scene("none", tmp_path, conf=ROOT / "conf", overrides=overrides)
+        with pytest.raises(UserError, match=r"scene\.yaml"):
+            check_scene("none", tmp_path, conf=ROOT / "conf", overrides=overrides, store=False)
 
 
 def test_scenes_and_jobs_of_one_command_share_what_was_looked_at(

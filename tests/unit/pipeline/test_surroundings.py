@@ -117,7 +117,6 @@ def test_an_empty_git_folder_is_no_repository(tmp_path: Path) -> None:
 
 
 FOREIGN = {
-    "MLFLOW_TRACKING_URI": "./mlruns",
     "MLFLOW_EXPERIMENT_NAME": "x",
     "MLFLOW_RUN_ID": "x",
     "HYDRA_FULL_ERROR": "1",
@@ -130,6 +129,7 @@ FOREIGN = {
     "GIT_DIR": "/x",
 }
 KEPT = {
+    "MLFLOW_TRACKING_URI": "http://mlflow.lab:5000",
     "MLFLOW_TRACKING_USERNAME": "me",
     "MLFLOW_TRACKING_TOKEN": "t",
     "CUDA_VISIBLE_DEVICES": "0",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
@@ -21,6 +20,7 @@ from sceneexpander.report.course import fits
 from sceneexpander.report.curve import Curve, curve_chart, objective_curves
 from sceneexpander.report.words import number_tables
 from sceneexpander.tracking import scene_runs
+from tests.support.pages import Links
 from tests.worlds.reports import (
     FITTING,
     HARM,
@@ -34,25 +34,6 @@ def page(gathered: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     write_page([gathered], folder)
     return folder / "index.html"
-
-
-class Links(HTMLParser):
-    """Everything the page loads."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-        self.scripts = 0
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.scripts += tag == "script"
-        for name, value in attrs:
-            if (
-                (name in {"src", "poster", "href"} or (name.startswith("data-") and tag == "video"))
-                and value
-                and "/" in value
-            ):
-                self.found.append(value)
 
 
 def test_every_file_it_names_is_there_and_none_is_remote(page: Path) -> None:

@@ -14,19 +14,11 @@ from sceneexpander.artifacts.proposals import Proposal, Proposals
 from sceneexpander.catalogue import MAIN
 from sceneexpander.report import SceneSource, collect_scene, write_page
 from tests.support.browser import Page, browser_page
+from tests.support.pages import NARROW, SCROLLING, STICKING_OUT, WIDE
 from tests.worlds.reports import row
 from tests.worlds.reports_with_cameras import with_cameras
 
-WIDE, NARROW = 1280, 390
 VIEWS = ("a_photo_with_quite_a_long_name", "v0", "v1", "v2")
-# Elements that stick out, or that scroll within themselves.
-STICKING_OUT = """[...document.querySelectorAll('main *')].filter(e => {
-  const box = e.getBoundingClientRect();
-  return box.width && (box.right > innerWidth + 1 || box.left < -1);
-}).map(e => e.tagName + '.' + e.className)"""
-SCROLLING = """[...document.querySelectorAll('main *')].filter(e =>
-  e.scrollWidth > e.clientWidth + 1 && ['auto', 'scroll'].includes(getComputedStyle(e).overflowX)
-).map(e => e.tagName + '.' + e.className)"""
 
 
 def with_rounds(source: SceneSource, folder: Path) -> SceneSource:

@@ -6,6 +6,8 @@ import json
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -13,7 +15,14 @@ from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
 from sceneexpander.catalogue import Group, measured_metrics
 from sceneexpander.catalogue.course import COURSE
 from sceneexpander.tracking import TrackingConfig, record_runs
-from sceneexpander.tracking.describe import NOTE_TAG, experiment_links, experiment_note, run_note, saved_views
+from sceneexpander.tracking.describe import (
+    NOTE_TAG,
+    describe_experiment,
+    experiment_links,
+    experiment_note,
+    run_note,
+    saved_views,
+)
 from sceneexpander.tracking.store import NAMES, database_path, describe_experiments, last_experiment
 from tests.worlds.runs import CONFIG, client, record, runs
 
@@ -116,3 +125,26 @@ def test_a_run_says_what_it_is_in_what_fits_into_a_tag() -> None:
     assert "1 of 2 photos used" in note
     assert len(note) < 5000
     assert "- is blurred" in run_note("p", "captured", None, None, ["is blurred"])
+
+
+def test_who_comes_second_with_a_description_is_content_with_it() -> None:
+    """As a server with PostgreSQL answers two first writers: the tag is there, and setting it is refused."""
+    from mlflow.exceptions import MlflowException
+
+    class Store:
+        """The other writer is faster with every tag; ``theirs``: what it writes."""
+
+        def __init__(self, theirs: str | None) -> None:
+            self.theirs = theirs
+            self.tags: dict[str, str] = {}
+
+        def get_experiment(self, experiment: str) -> Any:
+            return SimpleNamespace(tags=dict(self.tags))
+
+        def set_experiment_tag(self, experiment: str, key: str, value: str) -> None:
+            self.tags[key] = value if self.theirs is None else self.theirs
+            raise MlflowException("duplicate key value violates unique constraint")
+
+    describe_experiment(Store(None), "1")
+    with pytest.raises(MlflowException):
+        describe_experiment(Store("another"), "1")
