@@ -350,13 +350,14 @@ def generate(
     for facts in _written(missing, folder, shrink, grades, processes):
         if on_scene is not None:
             on_scene(facts, True)
-    scenes = {
-        name: facts
-        for name in SCENES
-        if (folder / name / SCENE_FACTS).is_file() and (facts := read_facts(folder, name)).version == VERSION
-    }
-    contents = {name: facts.content for name, facts in scenes.items()}
-    full = all(facts.shrink == 1 and set(facts.grades) == set(PICTURED) for facts in scenes.values())
+    scenes: dict[str, SceneFacts] = {}
+    for name in SCENES:
+        if (folder / name / SCENE_FACTS).is_file():
+            found = read_facts(folder, name)
+            if found.version == VERSION:
+                scenes[name] = found
+    contents = {name: found.content for name, found in scenes.items()}
+    full = all(found.shrink == 1 and set(found.grades) == set(PICTURED) for found in scenes.values())
     manifest = Manifest(
         version=VERSION,
         content=_digest(contents),
