@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +34,7 @@ from tests.worlds.captures import (
     pictures,
     pose,
     reality_capture,
+    seven_scenes,
     transforms,
     video,
 )
@@ -320,6 +322,20 @@ def test_more_posed_pictures_than_are_used_are_thinned_and_said(tmp_path: Path) 
     capture = read_capture(tmp_path, replace(CONFIG, max_views=2))
     assert [Path(shot.name).name for shot in capture.shots] == ["0.png", "2.png"]
     assert "2 of 3 pictures" in capture.notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("make", "file", "expected"),
+    [(seven_scenes, "frame-000001.pose.txt", "12 or 16"), (camera_texts, "cameras/0.txt", "21")],
+)
+def test_a_camera_with_the_numbers_of_another_kind_is_one_line(
+    tmp_path: Path, make: Callable[[Path], None], file: str, expected: str
+) -> None:
+    make(tmp_path)
+    for count in {12, 16, 21, 20} - {int(word) for word in expected.split(" or ")}:
+        (tmp_path / file).write_text("1 " * count)
+        with pytest.raises(UserError, match=f"holds {count} numbers, one camera has {expected} here"):
+            read_capture(tmp_path, CONFIG)
 
 
 def test_raw_depth_is_as_large_as_its_picture(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ class SevenScenes:
             pose_file = _pose_file(path)
             pose = None
             if pose_file.is_file():
-                pose = rigid_pose(_numbers(pose_file).reshape(-1, 4), pose_file)
+                pose = rigid_pose(_numbers(pose_file, (12, 16)).reshape(-1, 4), pose_file)
                 files.append(pose_file)
             shots.append(Shot(name=path.name, picture=path, world_from_cam=pose))
         if not shots:
@@ -81,11 +81,7 @@ class CameraTexts:
             pose, lens, file = None, None, known.pop(path.stem, None)
             if file is not None:
                 files.append(file)
-                values = _numbers(file)
-                if values.size != 21:
-                    raise UserError(
-                        f"holds {values.size} numbers, expected 3x4 of a pose and 3x3 of intrinsics", where=file
-                    )
+                values = _numbers(file, (21,))
                 pose, lens = rigid_pose(values[:12].reshape(3, 4), file), _lens(values[12:].reshape(3, 3), file)
             shots.append(
                 Shot(
@@ -175,13 +171,14 @@ def _depth_of(stem: str, place: Path, folders: tuple[str, ...]) -> DepthFile | N
     return None
 
 
-def _numbers(path: Path) -> np.ndarray:
-    """All numbers of a small text file."""
+def _numbers(path: Path, counts: tuple[int, ...]) -> np.ndarray:
+    """All numbers of a small text file. Raises `UserError` unless it holds as many of them as one of ``counts``."""
     try:
         words = read_plain_file(path, limit_bytes=_LIMIT_BYTES).decode().split()
         values = number_array([float(word) for word in words], path)
     except ValueError:
         raise UserError("holds something else where a number is expected", where=path) from None
-    if values.size not in (12, 16, 21):
-        raise UserError(f"holds {values.size} numbers, expected those of one camera", where=path)
+    if values.size not in counts:
+        expected = " or ".join(map(str, counts))
+        raise UserError(f"holds {values.size} numbers, one camera has {expected} here", where=path)
     return values
