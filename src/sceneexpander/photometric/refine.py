@@ -135,7 +135,7 @@ class _Fit:
         for name, optimiser in self.splats.optimisers.items():
             optimiser.param_groups[0]["lr"] = self._rates[name] * share
         loss = self._loss(view, picture, background)
-        (loss + self._exposures.penalty()).backward()
+        (loss + self._exposures.penalty()).backward()  # type: ignore[no-untyped-call]
         self.splats.step()
         self._exposures.step(share)
         return float(loss.detach())
