@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 _PRICE = 0.1  # of the mean square of logarithms of gains and of offsets: what explains nothing stays at 1 and 0
+_QUIET = 0.1  # Adam's epsilon: gradients well below it, of photos that are exposed alike, hardly move anything
 
 
 class Exposures:
@@ -28,7 +29,7 @@ class Exposures:
         self._rate = rate
         # Logarithms of gains, then offsets.
         self._change = torch.zeros(views, 2, 3, device=device, requires_grad=True)
-        self._optimiser = torch.optim.Adam([self._change], lr=rate)
+        self._optimiser = torch.optim.Adam([self._change], lr=rate, eps=_QUIET)
 
     def applied(self, rgb: Float[Tensor, "3 height width"], view: int) -> Float[Tensor, "3 height width"]:
         """What the scene shows as the photo of a view would have taken it."""

@@ -32,7 +32,7 @@ def test_photos_of_other_exposures_teach_the_scene_of_the_middle_one() -> None:
     exposed, _ = refine(spoiled(), pictures, replace(CONFIG, exposures=1e-2), seed=0)
     painted, _ = refine(spoiled(), pictures, replace(CONFIG, exposures=0.0), seed=0)
     for view in (0, 1):
-        assert shown(exposed, view) > shown(painted, view) + 1
+        assert shown(exposed, view) > shown(painted, view) + 0.5
 
 
 def test_they_are_relative_to_the_photos_mean() -> None:
