@@ -39,7 +39,7 @@ from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import check_scene
 from sceneexpander.pipeline.processes import ended_by_signals
 from sceneexpander.pipeline.project import find_project
-from sceneexpander.pipeline.selection import Selection, check_name, read_selection
+from sceneexpander.pipeline.selection import MOST_ROUNDS, PARAMS, Selection, check_name, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, reproduce
 from sceneexpander.plainfiles import require_plain_file
 from sceneexpander.report.cameras import camera_lines
@@ -290,10 +290,13 @@ def _place_name(place: Path) -> str:
 
 
 def check_source(folder: Path, request: Request) -> None:
-    """Raise `UserError` if the run in ``folder`` is of other photos: two folders may have one name, or names reduced to one."""
+    """Raise `UserError` if the run in ``folder`` is of other photos, or has grown since: two folders may have one name, or names reduced
+    to one, and rounds that were added would be lost.
+    """
     try:
         known: dict[str, Any] = json.loads((folder / SOURCE_FILE).read_text(encoding="utf-8"))
         photos, branch_of = Path(known["photos"]), known.get("branch_of")
+        rounds = int(known.get("rounds", MOST_ROUNDS))  # earlier versions did not note it
     except FileNotFoundError:
         return
     except (OSError, ValueError, KeyError, TypeError):
@@ -303,6 +306,9 @@ def check_source(folder: Path, request: Request) -> None:
         raise UserError(f"is a branch of the run {branch_of}", where=folder, fix=fix)
     if photos != _identity(request):
         raise UserError(f"holds another folder's scene ({photos})", where=folder, fix="choose another --name")
+    if (folder / PARAMS).is_file() and read_selection(folder).rounds > rounds:
+        fix = "go on with --continue, take them back with --undo, or choose another --name"
+        raise UserError("has rounds that were added to it", where=folder, fix=fix)
 
 
 def _identity(request: Request) -> Path:
@@ -361,8 +367,8 @@ def expand(request: Request, *, project: Path) -> Path | None:
             agree_to_requests(checked.forecasts, unattended=request.unattended)
             selection = Selection(scenes=(name,), rounds=checked.rounds, methods=base.methods, overrides=overrides)
             folder.mkdir(exist_ok=True)
-            source = json.dumps({"photos": os.fsdecode(_identity(request)), "name": name}, indent=1)
-            write_bytes_atomic(folder / SOURCE_FILE, f"{source}\n".encode())
+            source = {"photos": os.fsdecode(_identity(request)), "name": name, "rounds": checked.rounds}
+            write_bytes_atomic(folder / SOURCE_FILE, f"{json.dumps(source, indent=1)}\n".encode())
             make_workspace(folder, selection, project=project, scenes={name: scene}, move_scenes=True)
         reproduce(folder, project=project, lock=lock)
     return folder / "outputs" / "report" / "index.html"

@@ -160,7 +160,7 @@ def add_round(name: str, request: RoundRequest, *, project: Path) -> Path | None
         RuntimeError: a stage failed for another reason.
     """
     run = open_run(name, project)
-    with run_lock(run.folder) as lock:
+    with run_lock(run.folder, what=run.folder) as lock:
         run = open_run(name, project)  # as it is, now that nobody else changes it
         if request.is_empty:
             if run.is_finished:
@@ -185,7 +185,7 @@ def undo_round(name: str, *, project: Path) -> Path:
         UserError: there is no such run, it has one round only, or somebody else works on it.
     """
     run = open_run(name, project)
-    with run_lock(run.folder) as lock:
+    with run_lock(run.folder, what=run.folder) as lock:
         run = open_run(name, project)
         rounds = run.selection.rounds - 1
         if rounds < 1:
@@ -203,6 +203,9 @@ def proposal_lines(name: str, from_round: int | None, *, project: Path) -> list[
     """
     run = open_run(name, project)
     number = _known_round(run, from_round)
+    if number == 0:
+        problem = "0 is the captured scene, and proposals are made after rounds"
+        raise UserError(problem, where="--from-round", fix="name round 1 or a later one")
     place = run.outputs / f"round_{number}" / "proposals"
     if not place.is_dir():
         raise UserError(f"has no proposals after round {number}", where=run.folder, fix=f"finish it: --continue {name}")

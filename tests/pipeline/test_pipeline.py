@@ -230,8 +230,12 @@ def test_expand_refuses_before_it_runs_anything(
     assert not (finished.folder / "runs").exists()
 
 
-def test_expand_runs_a_folder_of_photos(finished: Project) -> None:
-    """Two photos and a picture; the stages themselves are covered above, so the smallest budget will do."""
+ROWS = ("captured", "sceneexpander")
+
+
+@pytest.fixture(scope="module")
+def mine(finished: Project) -> tuple[Path, str]:
+    """A run of two photos and a picture, and what was printed; the stages themselves are covered above, so the smallest budget will do."""
     scene = finished.folder / "scenes" / "room"
     photos = finished.folder / "photos"
     photos.mkdir()
@@ -239,11 +243,56 @@ def test_expand_runs_a_folder_of_photos(finished: Project) -> None:
         shutil.copyfile(scene / "captured" / f"photo_{index}.png", photos / f"photo_{index}.png")
     arguments = ["--inserted", str(scene / "inserted" / "round_1.png"), "--prompt", 'A "wall", further on.']
     arguments += ["--name", "mine", *SMOKE, "adapt.steps=1", "warmup.steps=0", "render.frames=4"]
-    done = finished.run("-m", "sceneexpander.expand", str(photos), *arguments)
-    page = finished.folder / "runs" / "mine" / "outputs" / "report" / "index.html"
-    assert done.stdout.strip().endswith(f"report: {page}")
+    params = finished.folder / "params.yaml"
+    before = params.read_text()
+    params.write_text(yaml.safe_dump(yaml.safe_load(before) | {"methods": [*ROWS]}))
+    runs = finished.runs()
+    try:
+        done = finished.run("-m", "sceneexpander.expand", str(photos), *arguments)
+    finally:
+        params.write_text(before)
+    assert finished.runs() == runs + len(ROWS), "runs of a workspace are tracked in the project"
+    return finished.folder / "runs" / "mine", done.stdout
+
+
+def test_expand_runs_a_folder_of_photos(mine: tuple[Path, str]) -> None:
+    run, printed = mine
+    page = run / "outputs" / "report" / "index.html"
+    assert printed.strip().endswith(f"report: {page}")
     assert "A &#34;wall&#34;, further on." in page.read_text()
-    assert finished.runs() == 3 * len(METHODS), "runs of a workspace are tracked in the project"
+
+
+def test_a_round_is_added_and_taken_back(finished: Project, mine: tuple[Path, str]) -> None:
+    """Only what is new runs, an earlier round keeps every bit, and going back runs no work at all."""
+    run, _ = mine
+
+    def grow(*arguments: str) -> tuple[set[str], str]:
+        done = finished.run("-m", "sceneexpander.expand", "--continue", "mine", *arguments)
+        return set(re.findall(r"Running stage '([^']+)'", done.stdout)), done.stdout
+
+    def content(folder: Path) -> dict[str, bytes]:
+        return {str(path.relative_to(run)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+    page = run / "outputs" / "pages" / "mine"
+    first, shown = content(run / "outputs" / "mine" / "round_1"), content(page)
+    executed, _ = grow("--generator", "reproject", "--motion", "turn left 10 degrees")
+    looks_at_all_rounds = {"resolve@mine", "prepare@mine", "collect@mine", "report", "track"}
+    assert looks_at_all_rounds < executed
+    assert all("round1" in name for name in executed - looks_at_all_rounds), executed
+    assert content(run / "outputs" / "mine" / "round_1") == first
+    row = json.loads((run / "outputs" / "mine" / "round_2" / "metrics" / "sceneexpander.json").read_text())
+    assert {"psnr_earlier_inserted_db", "psnr_worst_earlier_db"} <= row["values"].keys()
+    html = (run / "outputs" / "report" / "index.html").read_text()
+    assert "Drift of every region" in html
+    assert "Where the camera could go next" in html
+
+    proposed = finished.run("-m", "sceneexpander.expand", "--continue", "mine", "--propose").stdout
+    assert all(Path(place).is_file() for place in re.findall(r": (/.*\.png)", proposed))
+    undone, _ = grow("--undo")
+    assert undone == looks_at_all_rounds
+    assert content(run / "outputs" / "mine" / "round_1") == first
+    assert content(page) == shown
+    assert not (run / "outputs" / "mine" / "round_2").exists()
 
 
 def test_two_workspaces_share_what_they_have_in_common(finished: Project, tmp_path: Path) -> None:

@@ -107,6 +107,18 @@ def test_a_branch_is_not_replaced_by_other_photos(run: Path, project: Path, tmp_
         expand(request(tmp_path / "photos", tmp_path, name="b"), project=project)
 
 
+def test_the_first_command_again_loses_no_added_round(run: Path, project: Path, tmp_path: Path) -> None:
+    again = request(tmp_path / "photos", tmp_path, name="room")
+    add_round("room", LEFT, project=project)
+    before = without_locks(project)
+    with pytest.raises(UserError, match="has rounds that were added to it; go on with --continue"):
+        expand(again, project=project)
+    assert without_locks(project) == before
+    undo_round("room", project=project)
+    expand(again, project=project)
+    assert len(rounds_of(run)) == 1
+
+
 @pytest.mark.parametrize(
     ("name", "asked", "line"),
     [
@@ -150,7 +162,7 @@ def test_a_refused_round_changes_nothing(run: Path, project: Path, monkeypatch: 
 def test_somebody_elses_run_is_left_alone(run: Path, project: Path) -> None:
     before = everything(run)
     with somebody_at_work(run):
-        with pytest.raises(UserError, match="is being worked on"):
+        with pytest.raises(UserError, match=r"is being worked on .*; wait for it or end it$"):
             add_round("room", LEFT, project=project)
         with pytest.raises(UserError, match="is being worked on"):
             undo_round("room", project=project)
@@ -169,12 +181,12 @@ def test_an_unfinished_round_is_finished_first(run: Path, project: Path, monkeyp
     assert (started, rounds_of(run)) == ([run], before)
 
 
-def finish_round(run: Path, *, posed: bool, psnr_before: float, psnr_after: float) -> None:
+def finish_round(run: Path, *, posed: bool, before: dict[str, float], after: dict[str, float]) -> None:
     base = run / "outputs" / "room" / "round_1"
     inserted = view("n1", generated=True)
     provenance = Provenance(backend="replay", prompt="p", source="s", sha256="3" * 64)
     InsertedView(round=1, view=inserted, chosen=0, provenance=(provenance,)).save(base / "inserted")
-    for method, psnr in (("captured", psnr_before), ("sceneexpander", psnr_after)):
+    for method, values in (("captured", before), ("sceneexpander", after)):
         MetricsRow(
             scene="room",
             round=1,
@@ -182,7 +194,7 @@ def finish_round(run: Path, *, posed: bool, psnr_before: float, psnr_after: floa
             model="mini",
             weights_sha256="0",
             seed=0,
-            values={"psnr_captured_db": psnr},
+            values=values,
             views=(ViewMetrics(view_id="n1", generated=True, posed=posed),) if method != "captured" else (),
         ).save(base / "metrics" / f"{method}.json")
 
@@ -190,15 +202,19 @@ def finish_round(run: Path, *, posed: bool, psnr_before: float, psnr_after: floa
 @pytest.mark.parametrize(
     ("posed", "after", "reason"),
     [
-        (False, 24.9, "no camera could be estimated for its inserted view"),
-        (True, 21.5, "the captured views lost 3.5 dB (at most 3 are allowed)"),
-        (True, 22.5, None),
+        (False, (24.9, 19.9), "no camera could be estimated for its inserted view"),
+        (True, (21.5, 19.9), "the captured views lost 3.5 dB (at most 3 are allowed)"),
+        (True, (24.9, 16.0), "the views inserted earlier lost 4.0 dB (at most 3 are allowed)"),
+        (True, (22.5, 17.5), None),
     ],
 )
 def test_no_round_follows_one_that_failed(
-    posed: bool, after: float, reason: str | None, run: Path, project: Path
+    posed: bool, after: tuple[float, float], reason: str | None, run: Path, project: Path
 ) -> None:
-    finish_round(run, posed=posed, psnr_before=25.0, psnr_after=after)
+    names = "psnr_captured_db", "psnr_earlier_inserted_db"
+    finish_round(
+        run, posed=posed, before=dict(zip(names, (25.0, 20.0), strict=True)), after=dict(zip(names, after, strict=True))
+    )
     line = quality_line(growing.open_run("room", project), 1)
     assert line == (None if reason is None else f"round 1 failed quality control: {reason}")
     if reason is not None:
@@ -242,5 +258,7 @@ def test_the_words_become_a_round() -> None:
 
 
 def test_proposals_of_a_round_that_has_none_are_refused(run: Path, project: Path) -> None:
-    with pytest.raises(UserError, match="has no proposals after round 1"):
+    with pytest.raises(UserError, match="has no proposals after round 1; finish it"):
         proposal_lines("room", None, project=project)
+    with pytest.raises(UserError, match="is the captured scene, and proposals are made after rounds; name round 1"):
+        proposal_lines("room", 0, project=project)

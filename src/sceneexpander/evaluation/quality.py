@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from sceneexpander.artifacts.metrics import MetricsRow
 
-LARGEST_LOSS_DB = 3.0  # of the captured views' PSNR in one round; set by hand
+LARGEST_LOSS_DB = 3.0  # of an earlier region's PSNR in one round; set by hand
+_EARLIER = {"psnr_captured_db": "the captured views", "psnr_earlier_inserted_db": "the views inserted earlier"}
 
 
 def find_failures(row: MetricsRow, before: MetricsRow | None, inserted_id: str) -> tuple[str, ...]:
     """Why no round should follow this one; empty: nothing speaks against it.
 
-    A round fails when its inserted view has no camera, or when the captured views render more than `LARGEST_LOSS_DB` worse than before it.
+    A round fails when its inserted view has no camera, or when the captured views, or those inserted in earlier rounds, render more than
+    `LARGEST_LOSS_DB` worse than before it.
 
     Args:
         row: of the adapted scene after the round.
@@ -20,8 +22,9 @@ def find_failures(row: MetricsRow, before: MetricsRow | None, inserted_id: str) 
     found = []
     if any(view.view_id == inserted_id and not view.posed for view in row.views):
         found.append("no camera could be estimated for its inserted view")
-    now = row.value("psnr_captured_db")
-    then = None if before is None else before.value("psnr_captured_db")
-    if now is not None and then is not None and then - now > LARGEST_LOSS_DB:
-        found.append(f"the captured views lost {then - now:.1f} dB (at most {LARGEST_LOSS_DB:g} are allowed)")
+    for name, what in _EARLIER.items():
+        now = row.value(name)
+        then = None if before is None else before.value(name)
+        if now is not None and then is not None and then - now > LARGEST_LOSS_DB:
+            found.append(f"{what} lost {then - now:.1f} dB (at most {LARGEST_LOSS_DB:g} are allowed)")
     return tuple(found)

@@ -28,7 +28,7 @@ FEWEST_NEW = 0.1  # of a proposed picture
 MOST_PROPOSALS = 3
 _LEAST_APART = 0.35  # of proposed cameras: radians, and distances in those to what the camera looks at
 _RATED_SIDE_PX = 96
-_FACE_PX, _MAP_HEIGHT = 128, 144
+_FACE_PX, _MAP_HEIGHT = 192, 288
 _TURNS_DEG, _UPS_DEG, _ORBITS_DEG, _BACK = (20.0, 35.0, 50.0), (15.0, 25.0), (20.0, 35.0), 0.3
 
 

@@ -50,13 +50,13 @@ def fill_scene(page: ScenePage, folder: Path, *, media: str, walks: bool) -> _Fi
 
 def timeline(page: ScenePage, course: RoundsShown | None) -> list[_Filled]:
     """The rounds in order: sentence, inserted picture, and the drift of earlier views."""
-    drifts = {row.label: row.drift for row in course.rows} if course is not None else {}
+    drifts = {column.label: column.drift for column in course.columns} if course is not None else {}
     return [
         {
             "number": item.number,
             "prompt": item.prompt,
             "picture": item.inserted,
-            "drift": drifts.get(f"round {item.number}", ""),
+            "drift": f"{drift} dB" if (drift := drifts.get(f"round {item.number}", "")) else "",
         }
         for item in page.rounds
     ]

@@ -1,7 +1,8 @@
-"""What became of every region over the rounds: a heat map of views, the drift since each was new, time and memory."""
+"""What became of every region over the rounds: a heat map of views, the drift of each region since it was new, time and memory."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -10,7 +11,8 @@ from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
 from sceneexpander.artifacts.page import RoundPage
 
 WORST_DRIFT_DB = 3.0  # has the strongest colour
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP, _RIGHT = 560.0, 220.0, 56.0, 30.0, 14.0, 12.0
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP, _RIGHT = 560.0, 240.0, 66.0, 34.0, 18.0, 110.0
+_LINE_PX = 18.0  # of the labels at the right
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,7 +21,7 @@ class HeatCell:
 
     Attributes:
         text: its PSNR; empty: it was not there yet, or has no camera.
-        drift_db: change since it was first in the scene; None where there is no number.
+        drift_db: change since it was first in the scene, 0 where it is new; None where there is no number.
         strength: of the colour, from 0 to 1.
     """
 
@@ -35,20 +37,37 @@ class HeatCell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeatRow:
-    """All views after one round, and what the round took; ``label`` says which."""
+    """One view in all columns. ``generated``: it was inserted."""
+
+    name: str
+    generated: bool
+    cells: tuple[HeatCell, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeatColumn:
+    """The scene at one time; ``label`` says which. ``drift``, ``time`` and ``memory`` are texts, empty where there is none."""
 
     label: str
-    cells: tuple[HeatCell, ...]
-    drift: str
-    time: str
-    memory: str
+    drift: str = ""
+    time: str = ""
+    memory: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriftLine:
+    """A region over the rounds: the photos, or one inserted view. ``points`` are (round, change in dB since it was new)."""
+
+    label: str
+    generated: bool
+    points: tuple[tuple[int, float], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoundsShown:
-    """The heat map (``columns`` are views: name, whether generated) and the drift curve as SVG text, empty with one round."""
+    """The heat map and the drift curves as SVG text, empty with one round."""
 
-    columns: tuple[tuple[str, bool], ...]
+    columns: tuple[HeatColumn, ...]
     rows: tuple[HeatRow, ...]
     curve: str
 
@@ -70,69 +89,130 @@ def rounds_shown(
         before: of the captured scene.
         names: of the views, for people.
     """
-    measured: list[tuple[str, MetricsRow | None, RoundPage | None]] = []
-    if before is not None:
-        measured.append(("before", before, None))
-    measured += [(f"round {item.number}", row, item) for item, row in zip(rounds, rows, strict=True) if row is not None]
-    if not any(item is not None for _, _, item in measured):
+    times: list[tuple[int, MetricsRow, RoundPage | None]] = [] if before is None else [(0, before, None)]
+    times += [(item.number, row, item) for item, row in zip(rounds, rows, strict=True) if row is not None]
+    if not any(item is not None for _, _, item in times):
         return None
-    kinds = {view.view_id: view.generated for _, row, _ in measured if row is not None for view in row.views}
-    first: dict[str, float] = {}
-    shown: list[HeatRow] = []
-    drifts: list[tuple[int, float]] = []
-    for label, row, page in measured:
-        values = {view.view_id: view_psnr(view) for view in row.views} if row is not None else {}
-        older = [value - first[view] for view, value in values.items() if value is not None and view in first]
-        drift = sum(older) / len(older) if older else None
-        for view, value in values.items():
-            if value is not None:
-                first.setdefault(view, value)
-        cells = tuple(_cell(values.get(view), first.get(view)) for view in kinds)
-        runs = page.statistics.values() if page is not None else ()
-        shown.append(
+    generated = {view.view_id: view.generated for _, row, _ in times for view in row.views}
+    values = [{view.view_id: view_psnr(view) for view in row.views} for _, row, _ in times]
+    drifts = _drifts(values)
+    columns = tuple(_column(number, page, found) for (number, _, page), found in zip(times, drifts, strict=True))
+    lines = _regions([number for number, _, _ in times], drifts, generated, rounds)
+    return RoundsShown(
+        columns=columns,
+        rows=tuple(
             HeatRow(
-                label=label,
-                cells=cells,
-                drift="" if drift is None else f"{drift:+.2f} dB",
-                time=f"{sum(run.wall_s for run in runs):.0f} s" if runs else "",
-                memory=f"{max(run.peak_rss_mb for run in runs):.0f} MB" if runs else "",
+                name=names.get(view, view),
+                generated=is_generated,
+                cells=tuple(_cell(value.get(view), found, view) for value, found in zip(values, drifts, strict=True)),
             )
-        )
-        if page is not None and drift is not None:
-            drifts.append((page.number, drift))
-    columns = tuple((names.get(view, view), generated) for view, generated in kinds.items())
-    return RoundsShown(columns=columns, rows=tuple(shown), curve=drift_chart(drifts) if len(drifts) > 1 else "")
+            for view, is_generated in generated.items()
+        ),
+        curve=drift_chart(lines) if len(rounds) > 1 else "",
+    )
 
 
-def _cell(value: float | None, first: float | None) -> HeatCell:
-    if value is None or first is None:
+def _drifts(values: Sequence[Mapping[str, float | None]]) -> list[dict[str, float]]:
+    """At each time the change of every view that has a number since it first had one: 0 where it is new."""
+    first: dict[str, float] = {}
+    found = []
+    for now in values:
+        known = {view: value for view, value in now.items() if value is not None}
+        found.append({view: value - first.setdefault(view, value) for view, value in known.items()})
+    return found
+
+
+def _column(number: int, page: RoundPage | None, drifts: Mapping[str, float]) -> HeatColumn:
+    if page is None:
+        return HeatColumn(label="before")
+    older = [change for view, change in drifts.items() if view != page.inserted_id]
+    runs = page.statistics.values()
+    return HeatColumn(
+        label=f"round {number}",
+        drift=f"{sum(older) / len(older):+.2f}" if older else "",
+        time=f"{sum(run.wall_s for run in runs):.0f}" if runs else "",
+        memory=f"{max(run.peak_rss_mb for run in runs):.0f}" if runs else "",
+    )
+
+
+def _cell(value: float | None, drifts: Mapping[str, float], view: str) -> HeatCell:
+    if value is None:
         return HeatCell()
-    drift = value - first
+    drift = drifts[view]
     return HeatCell(text=f"{value:.1f}", drift_db=drift, strength=min(abs(drift) / WORST_DRIFT_DB, 1.0))
 
 
-def drift_chart(drifts: Sequence[tuple[int, float]]) -> str:
-    """SVG text: mean change in dB of all views that are older than a round, over the rounds."""
-    low = min(0.0, *(value for _, value in drifts))
-    high = max(0.0, *(value for _, value in drifts))
+def _regions(
+    numbers: Sequence[int],
+    drifts: Sequence[Mapping[str, float]],
+    generated: Mapping[str, bool],
+    rounds: Sequence[RoundPage],
+) -> list[DriftLine]:
+    photos = []
+    for number, found in zip(numbers, drifts, strict=True):
+        changes = [change for view, change in found.items() if not generated[view]]
+        if changes:
+            photos.append((number, sum(changes) / len(changes)))
+    lines = [DriftLine(label="photos", generated=False, points=tuple(photos))]
+    for item in rounds:
+        points = [
+            (n, found[item.inserted_id]) for n, found in zip(numbers, drifts, strict=True) if item.inserted_id in found
+        ]
+        lines.append(DriftLine(label=f"inserted {item.number}", generated=True, points=tuple(points)))
+    return [line for line in lines if line.points]
+
+
+def drift_chart(lines: Sequence[DriftLine]) -> str:
+    """SVG text: change in dB of every region since it was new, over the rounds; 0 is as it was then."""
+    numbers = sorted({number for line in lines for number, _ in line.points})
+    values = [value for line in lines for _, value in line.points]
+    low, high = min(0.0, *values), max(0.0, *values)
     span = max(high - low, 0.1)
-    rounds = [number for number, _ in drifts]
 
     def place(number: int, value: float) -> tuple[float, float]:
-        across = (number - rounds[0]) / max(rounds[-1] - rounds[0], 1)
+        across = (number - numbers[0]) / max(numbers[-1] - numbers[0], 1)
         up = (value - low) / span
         return _LEFT + across * (_WIDTH - _LEFT - _RIGHT), _HEIGHT - _BOTTOM - up * (_HEIGHT - _BOTTOM - _TOP)
 
-    parts = [f'<svg class="curve" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img" aria-label="drift over rounds">']
+    parts = [f'<svg class="curve" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img" aria-label="drift over the rounds">']
+    zero = place(numbers[0], 0.0)[1]
     for value in sorted({low, 0.0, high}):
-        y = place(rounds[0], value)[1]
+        y = place(numbers[0], value)[1]
+        if value and abs(y - zero) < _LINE_PX:
+            continue  # its label would lie on the other
         parts.append(f'<line class="axis" x1="{_LEFT}" y1="{y:.1f}" x2="{_WIDTH - _RIGHT}" y2="{y:.1f}"/>')
-        parts.append(f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{value:+.2f}</text>')
-    points = [place(*item) for item in drifts]
-    for (number, value), (x, y) in zip(drifts, points, strict=True):
-        anchor = "start" if number == rounds[0] else "end" if number == rounds[-1] else "middle"
-        parts.append(f'<text x="{x:.1f}" y="{_HEIGHT - 10}" text-anchor="{anchor}">round {number}</text>')
-        title = escape(f"round {number}: {value:+.2f} dB")
-        parts.append(f'<g class="without"><circle cx="{x:.1f}" cy="{y:.1f}" r="4"><title>{title}</title></circle></g>')
-    line = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    return "".join([*parts, f'<g class="without"><polyline points="{line}"/></g></svg>'])
+        shown = f"{value:+.2f}" if value else "0 dB"
+        parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{shown}</text>')
+    for number in numbers:
+        anchor = "start" if number == numbers[0] else "middle"
+        words = str(number) if number else "before"
+        parts.append(f'<text x="{place(number, 0)[0]:.1f}" y="{_HEIGHT - 10}" text-anchor="{anchor}">{words}</text>')
+    ends = _apart([place(*line.points[-1])[1] for line in lines])
+    for line, end in zip(lines, ends, strict=True):
+        points = [place(*point) for point in line.points]
+        dots = "".join(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4"><title>{escape(line.label)}, {_when(number)}: {value:+.2f} dB</title></circle>'
+            for (number, value), (x, y) in zip(line.points, points, strict=True)
+        )
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+        parts.append(f'<g class="{"with" if line.generated else "without"}"><polyline points="{path}"/>{dots}</g>')
+        parts.append(f'<text x="{points[-1][0] + 9:.1f}" y="{end + 4:.1f}">{escape(line.label)}</text>')
+    return "".join([*parts, "</svg>"])
+
+
+def _when(number: int) -> str:
+    return f"round {number}" if number else "before"
+
+
+def _apart(heights: Sequence[float]) -> list[float]:
+    """The heights, moved as far as labels there need to be read, in the same order from top to bottom."""
+    order = sorted(range(len(heights)), key=heights.__getitem__)
+    found = list(heights)
+    for above, below in itertools.pairwise(order):
+        found[below] = max(found[below], found[above] + _LINE_PX)
+    over = max(0.0, max(found) - (_HEIGHT - _BOTTOM))
+    if over:  # from the bottom upwards again
+        found[order[-1]] -= over
+        for below, above in zip(order[::-1], order[-2::-1], strict=False):
+            found[above] = min(found[above], found[below] - _LINE_PX)
+    return found
