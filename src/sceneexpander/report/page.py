@@ -56,7 +56,7 @@ def timeline(page: ScenePage, course: RoundsShown | None) -> list[_Filled]:
             "number": item.number,
             "prompt": item.prompt,
             "picture": item.inserted,
-            "drift": drifts.get(f"round {item.number}", ""),
+            "drift": f"{drift} dB" if (drift := drifts.get(f"round {item.number}", "")) else "",
         }
         for item in page.rounds
     ]

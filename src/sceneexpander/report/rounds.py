@@ -165,7 +165,9 @@ def _regions(
 
 
 def drift_chart(lines: Sequence[DriftLine]) -> str:
-    """SVG text: change in dB of every region since it was new, over the rounds; 0 is as it was then."""
+    """SVG text: change in dB of every region since it was new, over the rounds; 0 is as it was then. Empty without a region."""
+    if not lines:
+        return ""
     numbers = sorted({number for line in lines for number, _ in line.points})
     values = [value for line in lines for _, value in line.points]
     low, high = min(0.0, *values), max(0.0, *values)
