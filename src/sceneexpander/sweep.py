@@ -218,7 +218,7 @@ def check_axes(arguments: Sequence[str], project: Path) -> Axes:
             compose(project / "conf", [f"scene={scene_option(project / 'conf', scene)}", *selection.overrides])
     every = tuple(
         Job(scene=scene, overrides=overrides)
-        for scene in (names or [None])
+        for scene in (names or (None,))
         for overrides in itertools.product(*axes.values())
     )
     hydra = tuple(item for item in items if item not in axes)
@@ -444,10 +444,9 @@ def run_sweep(folder: Path, project: Path) -> int:
     """
     sweep = Sweep.load(folder)
     states = [job_state(folder, number) for number in range(len(sweep.jobs))]
-    missing = [number for number, state in enumerate(states) if not state.done]
-    for number in missing:
+    left, code = [number for number, state in enumerate(states) if not state.done], 0
+    for number in left:
         (folder / str(number) / STATE_FILE).unlink(missing_ok=True)
-    left, code = missing, 0
     environment = {name: value for name, value in os.environ.items() if not name.startswith("HYDRA_")}
     while left:
         # Jobs run in processes of their own, some of which Hydra's launchers do not end: they end with this one.
