@@ -194,8 +194,8 @@ def test_other_packages_rerun_everything(tiny: Tiny) -> None:
         ),
         (
             "frontend/sfm.py",
-            {"reconstruct", "reconstruct_inserted"},
-            {"prepare", "gaussian_splatting", "render", "evaluate"},
+            {"reconstruct", "reconstruct_inserted", "evaluate"},
+            {"prepare", "gaussian_splatting", "render"},
         ),
         (
             "models/mini/weights/mini.safetensors",
@@ -222,6 +222,7 @@ def test_a_configuration_names_its_files(tmp_path: Path, monkeypatch: pytest.Mon
         Path(name).touch()
     values = {
         "model": {"weights": "w.safetensors"},
+        "evaluate": {"lpips_weights": None},
         "judge": {"backend": "none"},
         "rivals": {"omnivggt": {"weights": None}, "ttt3r": {"weights": "org/name@main"}},
     }
