@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -190,6 +191,19 @@ def test_axes_of_a_transforms_file_can_be_said(tmp_path: Path) -> None:
     np.testing.assert_allclose(shots[0].world_from_cam[:3, 2], -pose(0)[:3, 2], atol=1e-9)
     assert shots[1].lens is not None
     assert shots[1].lens.focal_px == (150, 151)
+
+
+def test_axes_that_nobody_knows_are_refused(tmp_path: Path) -> None:
+    transforms(tmp_path)
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    for said, known in (("COLMAP", True), ("OpenGL (right, up, back)", True), ("unreal", False)):
+        path.write_text(json.dumps(content | {"camera_convention": said}))
+        if known:
+            assert read_capture(tmp_path, CONFIG).shots
+        else:
+            with pytest.raises(UserError, match=r"'unreal'.*camera_axes"):
+                read_capture(tmp_path, CONFIG)
 
 
 def test_masks_beside_pictures_are_not_used_pixels(tmp_path: Path) -> None:

@@ -21,11 +21,16 @@ from sceneexpander.ingest.jsonfile import number_at, read_user_json, text_at
 from sceneexpander.ingest.lens_models import Lens, Projection
 from sceneexpander.ingest.sources.capture import Capture, Shot, member, named, number_array, rigid_pose
 from sceneexpander.ingest.survey import natural_key
+from sceneexpander.typed import shorten
 
 _FILES = ("transforms.json", "transforms_train.json")
 _DEPTH_UNIT = 0.001  # of 16-bit pictures: millimetres, unless 'depth_unit_scale_factor' says otherwise
 _PINHOLE_MODELS = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
 _AXES_KEYS = ("camera_convention", "camera_axes", "coordinate_system")
+_AXES_WORDS = {
+    CameraAxes.OPENCV: ("opencv", "colmap"),
+    CameraAxes.OPENGL: ("opengl", "blender", "nerf", "instant-ngp"),
+}
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -78,7 +83,14 @@ def _axes(content: dict[str, Any], asked: CameraAxes, path: Path) -> CameraAxes:
     if asked is not CameraAxes.AUTO:
         return asked
     said = next((text_at(content, key, path) for key in _AXES_KEYS if isinstance(content.get(key), str)), None)
-    return CameraAxes.OPENCV if said is not None and "opencv" in said.casefold() else CameraAxes.OPENGL
+    if said is None:
+        return CameraAxes.OPENGL
+    for axes, words in _AXES_WORDS.items():
+        if any(word in said.casefold() for word in words):
+            return axes
+    raise UserError(
+        f"has cameras in axes called {shorten(said)!r}", where=path, fix="set scene.camera_axes to opengl or opencv"
+    )
 
 
 def _existing(folder: Path, name: str, endings: tuple[str, ...] = ("",)) -> Path | None:
