@@ -41,7 +41,7 @@ lint: .venv/.stamp ## Style and types
 	mypy
 
 test-unit: .venv/.stamp
-	OMP_NUM_THREADS=1 pytest tests/unit -n 2
+	OMP_NUM_THREADS=1 pytest tests/unit -n 2 --dist worksteal
 
 test-conformance: .venv/.stamp
 	pytest tests/conformance
