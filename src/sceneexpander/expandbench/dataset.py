@@ -32,7 +32,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -96,7 +96,7 @@ class TrueDetail:
     image: Float[Tensor, "3 height width"]
     depth: Float[Tensor, "height width"]
     normals: Float[Tensor, "height width 3"]
-    seen: Int[Tensor, "height width"]
+    seen: UInt8[Tensor, "height width"]
     world_from_cam: Float[Tensor, "4 4"]  # double precision
     intrinsics_px: Float[Tensor, "3 3"]
 

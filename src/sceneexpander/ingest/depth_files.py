@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from sceneexpander.errors import UserError
 from sceneexpander.plainfiles import read_plain_file
@@ -123,7 +123,11 @@ def _read_raw(data: bytes, path: Path, picture_size: tuple[int, int]) -> np.ndar
 _READERS = {DepthFormat.NPY: _read_npy, DepthFormat.PNG: _read_png, DepthFormat.RAW: _read_raw}
 
 
-def sampled_depth(depth: DepthMap, columns: np.ndarray, rows: np.ndarray) -> DepthMap:
+def sampled_depth(
+    depth: Float32[np.ndarray, "rows columns"],
+    columns: Float[np.ndarray, "*#pixel"],
+    rows: Float[np.ndarray, "*#pixel"],
+) -> Float32[np.ndarray, "*pixel"]:
     """Depth at places given as shares (0 to 1) of the picture's sides, nearest sample; 0 outside.
 
     Args:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 from numpy import ndarray
 from scipy import stats
 
@@ -132,7 +132,7 @@ def friedman_test(
     )
 
 
-def kendalls_w(ranks: Float[ndarray, "rater item"]) -> float:
+def kendalls_w(ranks: Real[ndarray, "rater item"]) -> float:
     """Agreement of rankings without ties, from 0 to 1: ``12 S / (m^2 (n^3 - n))``.
 
     Source: M. G. Kendall and B. Babington Smith, The problem of m rankings, 1939.

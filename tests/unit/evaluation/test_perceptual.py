@@ -81,6 +81,7 @@ def test_the_packages_blur_module_is_never_imported() -> None:
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.wrong_shapes
 def test_pictures_that_cannot_be_compared_are_refused() -> None:
     with pytest.raises(ValueError, match="cannot compare"):
         st_lpips(picture(), picture()[:, 1:])

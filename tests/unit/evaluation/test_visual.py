@@ -113,6 +113,7 @@ def test_flip_is_0_for_equal_pictures_1_for_black_and_white_and_in_the_row() -> 
 
 
 @pytest.mark.parametrize("measure", [flip_map, lambda a, b: lpips(a, b, Path("unused"))])
+@pytest.mark.wrong_shapes
 def test_what_cannot_be_compared_is_refused(measure) -> None:  # type: ignore[no-untyped-def]
     first, second = pictures()
     with pytest.raises(ValueError, match="cannot compare images of"):

@@ -35,7 +35,7 @@ from stages import adapt, correct, layout
 
 ROOT = Path(__file__).parents[3]
 GRADE = "mixed_2"
-QUICK = ("frontend.sfm.learned=never", "warmup.steps=0", "refine.visits=1")
+QUICK = ("frontend.sfm.learned=never", "frontend.sfm.max_features=800", "warmup.steps=0", "refine.visits=1")
 
 
 def config(row: str) -> ProjectConfig:

@@ -223,6 +223,7 @@ def test_large_images_are_matched_small_and_answered_large(wall: scenes.Scene) -
     assert float((result.depth / wall.depth - 1).abs().median()) < 0.03
 
 
+@pytest.mark.wrong_shapes
 def test_shapes_that_do_not_belong_together_are_refused(wall: scenes.Scene) -> None:
     with pytest.raises(ValueError, match="3 images, 2 poses"):
         dense_depth(wall.images, wall.world_from_cam[:2], wall.intrinsics_px, SparsePoints.empty(), CONFIG)

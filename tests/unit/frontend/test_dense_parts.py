@@ -208,6 +208,7 @@ def test_perturbed_poses_have_the_asked_size() -> None:
     assert float(step / baseline) == pytest.approx(0.02, rel=0.12)
 
 
+@pytest.mark.wrong_shapes
 def test_observations_must_name_existing_points() -> None:
     one = torch.zeros(1, dtype=torch.long)
     with pytest.raises(ValueError, match="point_index"):

@@ -343,6 +343,7 @@ def test_noise_images_are_unrelated() -> None:
     assert found.posed.tolist() == [True, False, False]
 
 
+@pytest.mark.wrong_shapes
 def test_bad_arguments_are_refused(scene: scenes.Scene) -> None:
     with pytest.raises(ValueError, match="at least one view"):
         estimate_cameras(torch.zeros(0, 3, 8, 8), FAST, generator=generator())

@@ -196,6 +196,7 @@ def views(valid: torch.Tensor | None, start: int) -> ViewSet:
     return ViewSet(records=records, images=images, detail_images=images, valid=valid)
 
 
+@pytest.mark.wrong_shapes
 def test_masks_travel_with_views(tmp_path: Path) -> None:
     mask = torch.rand(2, 4, 6) > 0.5
     masked, whole = views(mask, 0), views(None, 2)
