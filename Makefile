@@ -10,7 +10,7 @@ export MLFLOW_DISABLE_TELEMETRY := true
 export MLFLOW_SERVER_ENABLE_JOB_EXECUTION := false
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: repro test test-unit test-conformance test-pipeline lint setup ui view expand ablation mini-scores clean help
+.PHONY: repro test test-unit test-conformance test-pipeline test-slow lint setup ui view expand ablation mini-scores clean help
 
 help: ## What there is
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -41,13 +41,16 @@ lint: .venv/.stamp ## Style and types
 	mypy
 
 test-unit: .venv/.stamp
-	OMP_NUM_THREADS=1 pytest tests/unit -n 2 --dist worksteal
+	OMP_NUM_THREADS=1 pytest tests/unit -n 2 --dist worksteal -m "not slow"
 
 test-conformance: .venv/.stamp
 	pytest tests/conformance
 
 test-pipeline: .venv/.stamp
-	OMP_NUM_THREADS=1 pytest tests/pipeline -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 pytest tests/pipeline -n 2 --dist loadfile -m "not slow"
+
+test-slow: .venv/.stamp ## What `make test` leaves out for its length: lenses, many places, the long parts of the GPU check
+	OMP_NUM_THREADS=1 pytest tests/unit tests/pipeline -n 2 --dist worksteal -m slow
 
 ui: .venv/.stamp ## Runs in the browser (loopback only)
 	exec $(PY) -m sceneexpander.ui

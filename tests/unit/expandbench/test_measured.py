@@ -35,7 +35,7 @@ from stages import adapt, correct, layout
 
 ROOT = Path(__file__).parents[3]
 GRADE = "mixed_2"
-QUICK = ("frontend.sfm.learned=never", "frontend.sfm.max_features=800", "warmup.steps=0", "refine.visits=1")
+QUICK = ("frontend.sfm.learned=never", "frontend.sfm.max_features=1500", "warmup.steps=0", "refine.visits=1")
 
 
 def config(row: str) -> ProjectConfig:
@@ -63,7 +63,7 @@ def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[bench._Worker]:
             refine=shared.refine,
             cache=tmp_path_factory.mktemp("cache"),
         )
-        made = bench._Worker("corridor_2", settings)
+        made = bench._Worker("courtyard_1", settings)
         assert bool(made.case(GRADE).inputs.joint_priors.posed[-1]), "the inserted view takes part"
         yield made
 

@@ -138,6 +138,7 @@ def test_plain_walls_are_flagged(tmp_path: Path, mini: LoadedModel) -> None:
     assert made.psnr[0] > 25
 
 
+@pytest.mark.slow
 def test_many_photos_of_several_places_do_not_mix(tmp_path: Path, mini: LoadedModel) -> None:
     """As for sets too large to choose among models: the largest part that hangs together is posed, the rest is named."""
     many = replace(FRONTEND, sfm=SfmConfig(choose_most_views=2))

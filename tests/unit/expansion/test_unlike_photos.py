@@ -136,6 +136,7 @@ def test_a_zoomed_photo_is_right_or_named(tmp_path: Path) -> None:
         assert made.report.summary().startswith("4 of 5 photos used")
 
 
+@pytest.mark.slow
 def test_a_bent_lens_is_straightened(tmp_path: Path) -> None:
     made = Posed(photos(tmp_path, through_barrel))
     assert made.report.posed == 5
@@ -161,6 +162,7 @@ def test_exif_decides_where_two_photos_cannot(tmp_path: Path) -> None:
     assert made.focal_px(0) == pytest.approx(FOCAL_PX, rel=0.03)
 
 
+@pytest.mark.slow
 def test_wrong_exif_is_outvoted_and_said(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 75
