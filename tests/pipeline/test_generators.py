@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.generation.loopback import Service, picture, serving
+from tests.support.loopback import Service, picture, serving
 from tests.worlds.project import SMOKE, Project
 
 pytestmark = pytest.mark.pipeline

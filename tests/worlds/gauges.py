@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 
 from sceneexpander.adaptation.inputs import AdaptationInputs
-from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.geometry.priors import Priors
 from tests.support.gauged_model import GaugedReconstructor, gauged_scene
+from tests.worlds.anchors import anchors_of
 
 
 def enlarged(priors: Priors, factor: float) -> Priors:
@@ -26,15 +26,7 @@ def inputs_of(captured: int, factor: float) -> AdaptationInputs:
     alone = priors.select(range(captured))
     with torch.no_grad():
         frozen = GaugedReconstructor().predict(images[:captured], alone)
-    anchors = Anchors(
-        weights_sha256="0",
-        view_ids=tuple(f"{i}" for i in range(captured)),
-        camera_vector=frozen.camera_vector,
-        depth=frozen.depth,
-        depth_conf=frozen.depth_conf,
-        normals=frozen.normals,
-        normals_conf=frozen.normals_conf,
-    )
+    anchors = anchors_of(frozen)
     return AdaptationInputs(
         captured=images[:captured],
         inserted=images[captured],

@@ -14,7 +14,7 @@ from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.judge import ChatJudgeConfig, Judge, Shown, Work, make_judge
 from sceneexpander.services.pictures import SentPicture, encode_picture
-from tests.unit.generation.loopback import Answer, Service, said
+from tests.support.loopback import Answer, Service, said
 
 CONF = Path(__file__).parents[2] / "conf"
 KEY = "sk-verysecret0123456789"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -93,3 +94,17 @@ def made_views(images: torch.Tensor, detail_images: torch.Tensor) -> ViewSet:
         for index in range(len(images))
     )
     return ViewSet(records=records, images=images, detail_images=detail_images)
+
+
+@pytest.fixture
+def so_far() -> SceneSoFar:
+    """Three flat views side by side."""
+    images = torch.rand(3, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    return flat_scene(made_views(images, images), apart=0.2)
+
+
+@pytest.fixture
+def context(so_far: SceneSoFar, tmp_path: Path) -> GenerationContext:
+    """A round from ``so_far`` that says motion and object apart."""
+    spec = RoundSpec(prompt="x", motion="move right 30 %", new_object="a bench")
+    return context_of(Scene(name="s", views=so_far.views, rounds=(spec,)), tmp_path / "scene")

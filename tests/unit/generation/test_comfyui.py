@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.config.compose import compose
@@ -18,8 +17,8 @@ from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.generation import GenerationContext, SceneSoFar, make_generator
-from tests.unit.generation.loopback import Answer, Asked, Service, drawn, said, serving
-from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
+from tests.support.loopback import Answer, Asked, Service, drawn, said, serving
+from tests.worlds.rounds import context_of
 
 CONF = Path(__file__).parents[3] / "conf"
 WORKFLOW: dict[str, Any] = {
@@ -69,12 +68,6 @@ def comfy(monkeypatch: pytest.MonkeyPatch) -> Iterator[Comfy]:
     monkeypatch.setattr("sceneexpander.generation.backends.comfyui._POLL_S", 0.01)
     with serving() as service:
         yield Comfy(service)
-
-
-@pytest.fixture
-def so_far() -> SceneSoFar:
-    images = torch.rand(3, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
-    return flat_scene(made_views(images, images), apart=0.2)
 
 
 @pytest.fixture

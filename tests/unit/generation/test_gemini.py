@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.config.compose import compose
@@ -20,24 +18,11 @@ from sceneexpander.errors import UserError
 from sceneexpander.generation import GenerationContext, SceneSoFar
 from sceneexpander.generation.backends.gemini import GeminiConfig, GeminiService, nearest_ratio
 from sceneexpander.generation.service import ServiceGenerator
-from tests.unit.generation.loopback import Answer, Service, drawn, said, serving
-from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
+from tests.support.loopback import Answer, Service, drawn, said
+from tests.worlds.rounds import context_of
 
 CONF = Path(__file__).parents[3] / "conf"
 KEY = "AIzaverysecret0123456789"
-
-
-@pytest.fixture
-def service(monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    monkeypatch.setenv("TEST_KEY", KEY)
-    with serving() as found:
-        yield found
-
-
-@pytest.fixture
-def so_far() -> SceneSoFar:
-    images = torch.rand(3, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
-    return flat_scene(made_views(images, images), apart=0.2)
 
 
 @pytest.fixture

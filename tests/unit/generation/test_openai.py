@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import logging
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,33 +15,19 @@ import torch
 from PIL import Image
 
 from sceneexpander.artifacts.candidates import CandidateSet
-from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.artifacts.source_type import MADE_BY_MODEL
 from sceneexpander.errors import UserError
 from sceneexpander.generation import ChoiceConfig, GenerationContext, SceneSoFar, choose_view
 from sceneexpander.generation.backends.openai import asked_size
-from tests.unit.generation.loopback import Answer, Service, drawn, error, picture, said, serving
-from tests.unit.generation.openai_service import KEY, generator, settings
-from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
-
-
-@pytest.fixture
-def service(monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    monkeypatch.setenv("TEST_KEY", KEY)
-    with serving() as found:
-        yield found
+from tests.support.loopback import Answer, Service, drawn, error, picture, said
+from tests.support.openai_service import KEY, generator, settings
+from tests.worlds.rounds import HEIGHT, WIDTH, flat_scene, made_views
 
 
 @pytest.fixture
 def so_far() -> SceneSoFar:
     images = torch.rand(5, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
     return flat_scene(made_views(images, images), apart=0.2)
-
-
-@pytest.fixture
-def context(so_far: SceneSoFar, tmp_path: Path) -> GenerationContext:
-    spec = RoundSpec(prompt="x", motion="move right 30 %", new_object="a bench")
-    return context_of(Scene(name="s", views=so_far.views, rounds=(spec,)), tmp_path / "scene")
 
 
 def test_what_is_sent_and_what_is_recorded(

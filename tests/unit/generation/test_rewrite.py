@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.errors import UserError
 from sceneexpander.generation import GenerationContext, SceneSoFar
 from sceneexpander.generation.service import ServiceGenerator
-from tests.unit.generation.loopback import Answer, Asked, Service, error, picture, said, serving
-from tests.unit.generation.openai_service import KEY, generator, settings
-from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
+from tests.support.loopback import Answer, Asked, Service, error, picture, said
+from tests.support.openai_service import KEY, generator, settings
 
 GIVEN = "You are exploring. Please generate a new viewpoint following the requirements: move right 30 %, a bench."
 SENT = "Step to the right by a third of the way and show a bench."
@@ -27,25 +22,6 @@ SENT = "Step to the right by a third of the way and show a bench."
 def instruction(text: str = SENT) -> Answer:
     content = json.dumps({"instruction": text})
     return said({"model": "chat-1", "choices": [{"message": {"content": content}, "finish_reason": "stop"}]})
-
-
-@pytest.fixture
-def service(monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    monkeypatch.setenv("TEST_KEY", KEY)
-    with serving() as found:
-        yield found
-
-
-@pytest.fixture
-def so_far() -> SceneSoFar:
-    images = torch.rand(3, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
-    return flat_scene(made_views(images, images), apart=0.2)
-
-
-@pytest.fixture
-def context(so_far: SceneSoFar, tmp_path: Path) -> GenerationContext:
-    spec = RoundSpec(prompt="x", motion="move right 30 %", new_object="a bench")
-    return context_of(Scene(name="s", views=so_far.views, rounds=(spec,)), tmp_path / "scene")
 
 
 def rewriting(

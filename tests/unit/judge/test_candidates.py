@@ -2,41 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from sceneexpander.artifacts.agreement import CandidateScore
-from sceneexpander.artifacts.scene import RoundSpec, Scene
 from sceneexpander.generation import GenerationContext, SceneSoFar
 from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.opinion import judge_candidates
 from sceneexpander.ingest.fit import FittedPicture, fit_picture
-from tests.unit.generation.loopback import Service, serving
-from tests.worlds.judged import KEY, judge_of, refusal, scored
-from tests.worlds.rounds import HEIGHT, WIDTH, context_of, flat_scene, made_views
-
-
-@pytest.fixture
-def service(monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    monkeypatch.setenv("TEST_KEY", KEY)
-    with serving() as found:
-        yield found
-
-
-@pytest.fixture
-def so_far() -> SceneSoFar:
-    images = torch.rand(3, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
-    return flat_scene(made_views(images, images), apart=0.2)
-
-
-@pytest.fixture
-def context(so_far: SceneSoFar, tmp_path: Path) -> GenerationContext:
-    spec = RoundSpec(prompt="x", motion="move right 30 %", new_object="a bench")
-    return context_of(Scene(name="s", views=so_far.views, rounds=(spec,)), tmp_path / "scene")
+from tests.support.loopback import Service
+from tests.worlds.judged import judge_of, refusal, scored
+from tests.worlds.rounds import HEIGHT, WIDTH
 
 
 def candidate(seed: int, so_far: SceneSoFar) -> FittedPicture:

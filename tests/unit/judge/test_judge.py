@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +16,8 @@ from sceneexpander.errors import UserError
 from sceneexpander.judge import judge_round, make_judge
 from sceneexpander.judge.config import NoJudgeConfig
 from sceneexpander.judge.rounds import questions_of
-from tests.unit.generation.loopback import Answer, Service, error, said, serving
+from tests.support.loopback import Answer, Service, error, said
 from tests.worlds.judged import KEY, judge_of, message, preferred, refusal, scored, settings, work_of
-
-
-@pytest.fixture
-def service(monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    monkeypatch.setenv("TEST_KEY", KEY)
-    with serving() as found:
-        yield found
 
 
 def body_of(service: Service, index: int = 0) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from sceneexpander.pipeline.project import JUDGED_FOLDER, ROOT_ENV
 from sceneexpander.splatting.video import write_video
 from stages import judge as judge_stage
 from stages.runner import Cell
-from tests.unit.generation.loopback import Service, serving
+from tests.support.loopback import Service, serving
 from tests.worlds.judged import CONF, KEY, scored
 from tests.worlds.rounds import made_views
 

@@ -14,6 +14,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
 
@@ -87,6 +88,14 @@ def serving() -> Iterator[Service]:
     finally:
         server.shutdown()
         server.server_close()
+
+
+@pytest.fixture
+def service(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
+    """A service for one test; the ``KEY`` of the module, if it has one, is in the environment as TEST_KEY."""
+    monkeypatch.setenv("TEST_KEY", getattr(request.module, "KEY", "a key"))
+    with serving() as found:
+        yield found
 
 
 def drawn(seed: int, width: int = 240, height: int = 160) -> bytes:

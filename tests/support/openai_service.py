@@ -11,9 +11,9 @@ from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.generation.backends.openai import OpenAIConfig, OpenAIService
 from sceneexpander.generation.service import ServiceGenerator
-from tests.unit.generation.loopback import Service
+from tests.support.loopback import Service
 
-CONF = Path(__file__).parents[3] / "conf"
+CONF = Path(__file__).parents[2] / "conf"
 KEY = "sk-verysecret0123456789"
 
 
