@@ -29,6 +29,7 @@ from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.measure import Measure, SeenView, UnseenView, Values
+from sceneexpander.plainfiles import require_plain_file
 
 LEAST_SIDE_PX = 35  # smaller pictures vanish inside AlexNet
 _PPD = 67.0
@@ -95,6 +96,12 @@ def lpips(
     """
     pair = _pair(image, reference)
     return float(_network(weights).distance(pair)) if min(pair.shape[2:]) >= LEAST_SIDE_PX else None
+
+
+def check_lpips_weights(weights: Path) -> None:
+    """Raise `UserError` if `lpips` cannot be measured with these weights."""
+    require_plain_file(weights, where=f"{_WHERE} {weights}")
+    _network(weights)
 
 
 @functools.cache

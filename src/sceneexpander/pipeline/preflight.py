@@ -13,9 +13,10 @@ from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.image import WINDOW
+from sceneexpander.evaluation.visual import check_lpips_weights
 from sceneexpander.generation import Forecast, GenerationContext, check_round
 from sceneexpander.inference.config import RivalsConfig
-from sceneexpander.ingest import load_scene
+from sceneexpander.ingest import hold_out, load_scene
 from sceneexpander.ingest.truth import check_truth
 from sceneexpander.judge import make_judge
 from sceneexpander.models.weights import HUB_ID
@@ -40,6 +41,7 @@ class Checked:
     weights: set[ModelConfig] = field(default_factory=set)
     pictures: dict[Hashable, CheckedScene] = field(default_factory=dict)
     stores: set[TrackingConfig] = field(default_factory=set)
+    lpips: set[str] = field(default_factory=set)
 
 
 CHECKED_SECTIONS = (
@@ -50,6 +52,7 @@ CHECKED_SECTIONS = (
     "judge",
     "model",
     "rivals",
+    "evaluate",
 )  # of the configuration, beside the device
 
 
@@ -101,7 +104,7 @@ def check_scene(
         require_server(tracking)
         checked.stores.add(tracking)
     obtained = tuple((number, repr(item.generator), item.choose) for number, item in {0: config, **own}.items())
-    pictures = folder, config.scene, obtained, rounds
+    pictures = folder, config.scene, config.evaluate.hold_out, obtained, rounds
     if pictures not in checked.pictures:
         checked.pictures[pictures] = _check_pictures(name, folder, config, own, rounds)
     needed = [config.model]
@@ -120,6 +123,10 @@ def check_scene(
         if model not in checked.weights:
             check_weights(model)
             checked.weights.add(model)
+    lpips = config.evaluate.lpips_weights
+    if lpips is not None and lpips not in checked.lpips:
+        check_lpips_weights(Path(lpips))
+        checked.lpips.add(lpips)
     return checked.pictures[pictures]
 
 
@@ -127,7 +134,9 @@ def _check_pictures(
     name: str, folder: Path, config: ProjectConfig, own: Mapping[int, ProjectConfig], rounds: int | None
 ) -> CheckedScene:
     """Read the photos, the pictures to insert that are there already, and what is known of the truth. ``own``: of rounds that have one."""
-    scene = load_scene(folder, config.scene)
+    whole = load_scene(folder, config.scene)
+    # As the stages see it: what is asked of a service must be the same here.
+    scene, _ = hold_out(whole, config.evaluate.hold_out)
     if min(scene.views.height, scene.views.width) < WINDOW:
         size = f"{scene.views.width} x {scene.views.height}"
         raise UserError(
@@ -136,7 +145,7 @@ def _check_pictures(
             fix="raise it, or use photos that are less narrow",
         )
     count = len(scene.rounds) if rounds is None else rounds
-    records, forecasts = [*scene.views.records], []
+    records, forecasts = [*whole.views.records], []
     for number in range(1, count + 1):
         context = GenerationContext(
             scene_folder=folder,

@@ -408,3 +408,18 @@ def test_no_reader_runs_what_it_reads() -> None:
                 assert not any(
                     k.arg in ("shell", "allow_pickle") and getattr(k.value, "value", 1) for k in node.keywords
                 ), path
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.zip", b"hello", r"a\.zip: is not an archive, as its name says"),
+        ("a.zip", b"", r"a\.zip: is not an archive, as its name says"),
+        ("a.7z", b"7z\xbc\xaf\x27\x1c", r"a\.7z: is a 7z archive; unpack it"),
+        ("photos", b"7z\xbc\xaf\x27\x1c", r"photos: is a 7z archive; unpack it"),
+    ],
+)
+def test_archives_are_called_what_they_are(name: str, content: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=said):
+        read_capture(tmp_path / name, CONFIG)

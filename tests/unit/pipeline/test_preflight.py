@@ -69,6 +69,21 @@ def test_a_server_for_runs_is_there_before_anything_is_read(
             check_scene("none", tmp_path, conf=ROOT / "conf", overrides=overrides, store=False)
 
 
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("evaluate.hold_out=7", r"^evaluate\.hold_out: is 7, but the scene has 8 photos"),
+        ("evaluate.lpips_weights=nowhere.pth", r"^evaluate\.lpips_weights nowhere\.pth: does not exist"),
+        ("evaluate.lpips_weights=/dev/zero", r"^evaluate\.lpips_weights /dev/zero: is a character device"),
+    ],
+)
+def test_what_only_the_last_stages_read_is_looked_at_first(override: str, said: str) -> None:
+    """Otherwise it would cost the whole run."""
+    overrides = ["profile=smoke", "scene.long_side_px=98", override]
+    with pytest.raises(UserError, match=said):
+        check_scene("courtyard", ROOT / "scenes" / "courtyard", conf=ROOT / "conf", overrides=overrides)
+
+
 def test_scenes_and_jobs_of_one_command_share_what_was_looked_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -54,19 +54,15 @@ def find_source(place: Path, name: str = AUTO, *, where: str | Path = "source") 
         return name
     found = next((known for known, source in SOURCES.items() if source.detect(place)), None)
     if found is None:
-        archive = _archive_words(place)
-        if archive:
+        content, ending = name_of_content(read_head(place)) or "", kind_of_file(place.suffix[1:].casefold())
+        if content.endswith("archive"):
             fix = "unpack it and give the folder; 'sceneexpander expand' takes ZIP archives"
-            raise UserError(f"is {archive}", where=place, fix=fix)
+            raise UserError(f"is {content}", where=place, fix=fix)
+        if ending.endswith("archive"):
+            raise UserError(f"is not {ending}, as its name says", where=place, fix="save or download it again")
         kinds = ", ".join(source.title for source in SOURCES.values())
         raise UserError("is no capture that can be read", where=place, fix=f"give one of: {kinds}")
     return found
-
-
-def _archive_words(place: Path) -> str:
-    """What to call a file that is an archive; empty for others."""
-    words = name_of_content(read_head(place)) or kind_of_file(place.suffix[1:].casefold())
-    return words if words.endswith("archive") else ""
 
 
 def read_capture(place: Path, config: IngestConfig, name: str = AUTO, *, where: str | Path = "source") -> Capture:
