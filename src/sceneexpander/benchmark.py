@@ -89,7 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise UserError(f"means nothing to {given.action!r}", where=f"--{name}", fix="leave it out")
     if given.overrides and given.rows is None:
         raise UserError(
-            "changes rows of this program, and none is asked for", where=given.overrides[0], fix="give --rows"
+            "changes rows of this program, and none is asked for",
+            where=given.overrides[0],
+            fix="give --rows; results of others are --results NAME=FOLDER",
         )
     {"generate": _generate, "verify": _verify, "leaderboard": _leaderboard, "place": _place}[given.action](given)
 
