@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.ingest.config import IngestConfig
-from sceneexpander.ingest.formats import kind_of_file, name_of_content, read_head
+from sceneexpander.ingest.formats import kind_of_file, name_of_content, read_head, sniff_format
 from sceneexpander.ingest.sources.camera_files import CameraParams, CameraTexts, SevenScenes
 from sceneexpander.ingest.sources.capture import Capture, Shot, Source
 from sceneexpander.ingest.sources.colmap import ColmapModel
@@ -54,7 +54,10 @@ def find_source(place: Path, name: str = AUTO, *, where: str | Path = "source") 
         return name
     found = next((known for known, source in SOURCES.items() if source.detect(place)), None)
     if found is None:
-        content, ending = name_of_content(read_head(place)) or "", kind_of_file(place.suffix[1:].casefold())
+        head = read_head(place)
+        if sniff_format(head):
+            raise UserError("is one picture", where=place, fix="give the folder that the photos are in")
+        content, ending = name_of_content(head) or "", kind_of_file(place.suffix[1:].casefold())
         if content.endswith("archive"):
             fix = "unpack it and give the folder; 'sceneexpander expand' takes ZIP archives"
             raise UserError(f"is {content}", where=place, fix=fix)
