@@ -72,6 +72,13 @@ def test_no_file_runs_what_it_reads(path: Path) -> None:
     assert found <= ALLOWED.get(path.relative_to(PROJECT).as_posix(), set())
 
 
+def test_no_reader_of_captures_starts_a_program() -> None:
+    for path in (PROJECT / "src" / "sceneexpander" / "ingest").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            assert not isinstance(node, ast.Import) or "subprocess" not in [alias.name for alias in node.names], path
+            assert not isinstance(node, ast.ImportFrom) or node.module != "subprocess", path
+
+
 def test_the_exceptions_are_all_used() -> None:
     for name, parts in ALLOWED.items():
         assert set(unsafe_parts((PROJECT / name).read_text(encoding="utf-8"))) == parts
