@@ -345,7 +345,7 @@ def _no_messages() -> Iterator[None]:
         os.close(nowhere)
 
 
-class _WhileAnyoneIsInside:
+class _WhileAnyoneIsInside(contextlib.AbstractContextManager[None]):
     """A context of the whole process, entered by the first of several threads and left by the last.
 
     Each thread keeping and restoring such a state by itself would restore what another one has set.
