@@ -34,7 +34,9 @@ from sceneexpander.generation import Forecast, backend_of
 from sceneexpander.ingest import IngestConfig, make_round, read_picture, safe_name, scene_files
 from sceneexpander.ingest.archives import is_archive, unpack_archive
 from sceneexpander.ingest.sources import read_capture
+from sceneexpander.ingest.sources.capture import named
 from sceneexpander.ingest.sources.posed import write_posed_photos
+from sceneexpander.ingest.survey import NoPicturesError, natural_key
 from sceneexpander.pipeline.disk import remove_tree
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import check_scene
@@ -211,7 +213,11 @@ def stage_scene(
         for k in range(max(count, 1))
     ]
     ingest = IngestConfig() if ingest is None else ingest
-    capture = read_capture(photos, ingest)
+    try:
+        capture = read_capture(photos, ingest)
+    except NoPicturesError:
+        _refuse_several_scenes(photos)
+        raise
     if any(shot.calibrated or shot.mask or shot.depth or isinstance(shot.picture, bytes) for shot in capture.shots):
         write_posed_photos(capture, target / "captured", ingest)
     else:
@@ -236,6 +242,16 @@ def stage_scene(
     content = {"name": name, "rounds": rounds, **({"notes": list(capture.notes)} if capture.notes else {})}
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     (target / SCENE_FILE).write_text(text, encoding="utf-8")
+
+
+def _refuse_several_scenes(folder: Path) -> None:
+    """Raise `UserError` if the folder is one of scene folders, as a project's ``scenes/`` is."""
+    names = sorted((path.parent.name for path in folder.glob(f"*/{SCENE_FILE}")), key=natural_key)
+    if names:
+        fix = f"expand one of them, or name them in 'scenes:' of the {PARAMS} beside a folder scenes/, and 'sceneexpander run'"
+        raise UserError(
+            f"is a folder of scene folders ({named([printable(name) for name in names])})", where=folder, fix=fix
+        )
 
 
 def inserted_name(number: int, source: Path) -> Path:

@@ -136,7 +136,7 @@ def _inserted(
     if item.picture is None or item.fitted is None:
         raise UserError(item.provenance.refusal or "no picture", where=item.provenance.source)
     view: ViewSet = view_from_fitted(
-        item.picture,
+        item.picture.facts,
         item.fitted,
         view_id=f"{views:03d}_inserted_{context.round_number}",
         generated=True,

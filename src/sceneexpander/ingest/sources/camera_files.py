@@ -39,18 +39,23 @@ class SevenScenes:
         return place.is_dir() and any(_pose_file(path).is_file() for path in _colour_frames(place))
 
     def read(self, place: Path, config: IngestConfig) -> Capture:
-        """All frames; some may have no pose."""
-        shots, files = [], []
+        """All frames; some may have no pose. Recordings of this form write numbers that are not finite where tracking was lost."""
+        shots, files, lost = [], [], []
         for path in _colour_frames(place):
             pose_file = _pose_file(path)
             pose = None
             if pose_file.is_file():
-                pose = rigid_pose(_numbers(pose_file, (12, 16)).reshape(-1, 4), pose_file)
+                values = _numbers(pose_file, (12, 16), finite=False)
+                if np.isfinite(values).all():
+                    pose = rigid_pose(values.reshape(-1, 4), pose_file)
+                else:
+                    lost.append(path.name)
                 files.append(pose_file)
             shots.append(Shot(name=path.name, picture=path, world_from_cam=pose))
         if not shots:
             raise UserError("holds no frame-XXXXXX.color.png", where=place)
-        return Capture(shots=tuple(shots), files=tuple(files), metric=True, chosen=True)
+        notes = (f"frames whose pose is not finite are taken without one: {named(lost)}",) if lost else ()
+        return Capture(shots=tuple(shots), notes=notes, files=tuple(files), metric=True, chosen=True)
 
 
 def _colour_frames(place: Path) -> list[Path]:
@@ -171,11 +176,12 @@ def _depth_of(stem: str, place: Path, folders: tuple[str, ...]) -> DepthFile | N
     return None
 
 
-def _numbers(path: Path, counts: tuple[int, ...]) -> np.ndarray:
-    """All numbers of a small text file. Raises `UserError` unless it holds as many of them as one of ``counts``."""
+def _numbers(path: Path, counts: tuple[int, ...], *, finite: bool = True) -> np.ndarray:
+    """All numbers of a small text file. Raises `UserError` unless it holds as many of them as one of ``counts``, and ``finite`` ones."""
     try:
         words = read_plain_file(path, limit_bytes=_LIMIT_BYTES).decode().split()
-        values = number_array([float(word) for word in words], path)
+        numbers = [float(word) for word in words]
+        values = number_array(numbers, path) if finite else np.asarray(numbers)
     except ValueError:
         raise UserError("holds something else where a number is expected", where=path) from None
     if values.size not in counts:

@@ -100,12 +100,16 @@ class ColmapModel:
 
     def detect(self, place: Path) -> bool:
         """Whether there is a model in one of the usual folders."""
-        return place.is_dir() and bool(_model_folders(place))
+        return place.is_dir() and (bool(_model_folders(place)) or _lone_part(place) is not None)
 
     def read(self, place: Path, config: IngestConfig) -> Capture:
         """The pictures that the model has cameras of."""
         folders = _model_folders(place)
         if not folders:
+            lone = _lone_part(place)
+            if lone is not None:
+                problem = "is one part of a model, whose other one (cameras or images, text or binary) is not beside it"
+                raise UserError(problem, where=lone, fix="put both there")
             places = ", ".join(_MODEL_FOLDERS)
             raise UserError("holds no COLMAP model", where=place, fix=f"cameras and images are looked for in: {places}")
         folder, pictures, images = _best(place, folders)
@@ -162,6 +166,16 @@ def _ending(folder: Path) -> str | None:
     for ending in ("bin", "txt"):
         if all((folder / f"{part}.{ending}").is_file() for part in ("cameras", "images")):
             return ending
+    return None
+
+
+def _lone_part(place: Path) -> Path | None:
+    """A file of a model that lacks its other one; looked for where only models are."""
+    for name in _MODEL_FOLDERS:
+        if "sparse" in PurePosixPath(name).parts:
+            for part in ("cameras.bin", "images.bin", "cameras.txt", "images.txt"):
+                if (place / name / part).is_file():
+                    return place / name / part
     return None
 
 
