@@ -55,7 +55,7 @@ import importlib, sys
 for command in sys.argv[1:]:
     module, *sys.argv[1:] = command.split()
     importlib.import_module(module).main()
-print(sorted({"torch", "numpy", "cv2", "mlflow", "hydra"} & set(sys.modules)))
+print(sorted({"torch", "numpy", "cv2", "mlflow", "hydra", "rich"} & set(sys.modules)))
 """
 
 
