@@ -24,7 +24,7 @@ from sceneexpander.generation.protocol import Forecast, GenerationContext, Scene
 from sceneexpander.generation.rank import rank_candidates
 from sceneexpander.generation.sheet import contact_sheet
 from sceneexpander.ingest.load import view_from_fitted
-from sceneexpander.judge import Judge
+from sceneexpander.judge.ask import Judge
 
 logger = logging.getLogger(__name__)
 
