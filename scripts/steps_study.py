@@ -69,12 +69,9 @@ class Study:
 
 def moved_by(inputs: RoundInputs, loaded: LoadedModel) -> float:
     """The verdict, see `Spend`."""
-    seen, count, posed = (
-        predict(inputs.views, inputs.joint_priors, loaded, inputs.state.weights),
-        len(inputs.state.views),
-        inputs.joint_priors.posed,
-    )
+    seen = predict(inputs.views, inputs.joint_priors, loaded, inputs.state.weights)
     assert seen.depth is not None  # noqa: S101 - the embedded model has the head
+    count, posed = len(inputs.state.views), inputs.joint_priors.posed
     return captured_moved(inputs.anchors, seen.depth[:count].cpu(), None if posed is None else posed[:count])
 
 
