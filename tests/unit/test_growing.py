@@ -124,7 +124,7 @@ def test_the_first_command_again_loses_no_added_round(run: Path, project: Path, 
     [
         ("rom", LEFT, "--continue: there is no run 'rom'; did you mean 'room'"),
         ("room", RoundRequest(), "--prompt: says not what to add; room is finished; add --prompt or --undo"),
-        ("room", RoundRequest(settings=LEFT.settings), "--prompt: has no prompt"),
+        ("room", RoundRequest(settings=LEFT.settings), '--prompt: has no prompt; say what to add, e.g. --prompt "'),
         ("room", RoundRequest(prompt="A lake."), "--inserted: the new round has no picture"),
         (
             "room",

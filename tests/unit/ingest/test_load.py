@@ -229,7 +229,7 @@ def test_heic_is_not_passed_over(tmp_path: Path) -> None:
         ("name: x\n", "has no rounds"),
         ("rounds: []\n", "has no rounds"),
         ("rounds: [{promt: A cat.}]\n", "did you mean 'prompt'?"),
-        ("rounds: [{prompt: '  '}]\n", "round 1: has no prompt"),
+        ("rounds: [{prompt: '  '}]\n", 'round 1: has no prompt; say what to add, e.g. prompt: "'),
         ("rounds: [{prompt: A cat.}, {inserted: x.png}]\n", "round 2: has no prompt"),
         ("rounds: [{prompt: [a, b]}]\n", "expected text"),
         ("rounds: [A cat.]\n", "round 1 holds str"),
