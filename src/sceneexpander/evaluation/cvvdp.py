@@ -71,7 +71,7 @@ def _metric() -> Any | None:
         _log.warning("the package cvvdp is not installed: no CVVDP; pip install --no-deps cvvdp==0.5.7")
         return None
     with _only_the_metric(package.submodule_search_locations or ()):
-        module = importlib.import_module(f"{PACKAGE}.cvvdp_metric")
+        module = importlib.import_module("pycvvdp.cvvdp_metric")
         return module.cvvdp(display_name=_DISPLAY, device=torch.device("cpu"), quiet=True)
 
 

@@ -76,7 +76,7 @@ def test_pictures_that_cannot_be_compared_are_refused() -> None:
 def test_without_the_package_there_is_no_number_and_one_line(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     module._metric.cache_clear()
     try:
         assert cvvdp(picture(), picture()) is None
