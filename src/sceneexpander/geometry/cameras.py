@@ -90,6 +90,13 @@ class Cameras:
             self.width,
         )
 
+    def find_repeats(self) -> list[int]:
+        """For each camera the index of the first that is the same to the last bit, its own where it is the first."""
+        rows = torch.cat([self.world_from_cam.flatten(1), self.intrinsics_px.flatten(1)], 1)
+        _, group = torch.unique(rows, dim=0, return_inverse=True)
+        first: dict[int, int] = {}
+        return [first.setdefault(number, index) for index, number in enumerate(group.tolist())]
+
     def resized(self, height: int, width: int) -> Cameras:
         """The same cameras with larger or smaller pictures."""
         intrinsics = resize_intrinsics(self.intrinsics_px, width / self.width, height / self.height)

@@ -96,8 +96,11 @@ def _through_the_cameras(
     ]
     order = shortest_path_order(reference.world_from_cam[[*seen, -1]], last=len(seen))
     there = [reference.view_ids[seen[i]] for i in order[:-1]]
-    keys = [*there, cameras.goal, *there[::-1]]
-    return navigation(*cameras.stacked(keys), config.frames, range(len(keys)))
+    keys = [*there, cameras.goal]
+    # The way back is the way there, to the last bit: what is drawn of a camera once is not drawn again.
+    poses, intrinsics = navigation(*cameras.stacked(keys), (config.frames + 1) // 2, range(len(keys)))
+    back = list(range(config.frames // 2))[::-1]
+    return torch.cat([poses, poses[back]]), torch.cat([intrinsics, intrinsics[back]])
 
 
 def _through_key_frames(
