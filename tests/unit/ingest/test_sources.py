@@ -502,9 +502,10 @@ def test_damaged_camera_files_are_one_line(
         ("a.zip", b"", r"a\.zip: is not an archive, as its name says"),
         ("a.7z", b"7z\xbc\xaf\x27\x1c", r"a\.7z: is a 7z archive; unpack it"),
         ("photos", b"7z\xbc\xaf\x27\x1c", r"photos: is a 7z archive; unpack it"),
+        ("a.png", b"\xff\xd8\xff\xe0\x00\x10JFIF", r"a\.png: is one picture; give the folder"),
     ],
 )
-def test_archives_are_called_what_they_are(name: str, content: bytes, said: str, tmp_path: Path) -> None:
+def test_files_are_called_what_they_are(name: str, content: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UserError, match=said):
         read_capture(tmp_path / name, CONFIG)

@@ -61,9 +61,10 @@ def find_source(place: Path, name: str = AUTO, *, where: str | Path = "source") 
         return name
     found = next((known for known, source in SOURCES.items() if source.detect(place)), None)
     if found is None:
-        if sniff_format(read_head(place)) is not None:
-            raise UserError("is a single picture", where=place, fix="give the folder of all photos of the place")
-        content, ending = name_of_content(read_head(place)) or "", kind_of_file(place.suffix[1:].casefold())
+        head = read_head(place)
+        if sniff_format(head):
+            raise UserError("is one picture", where=place, fix="give the folder that the photos are in")
+        content, ending = name_of_content(head) or "", kind_of_file(place.suffix[1:].casefold())
         if content.endswith("archive"):
             fix = "unpack it and give the folder; 'sceneexpander expand' takes ZIP archives"
             raise UserError(f"is {content}", where=place, fix=fix)
