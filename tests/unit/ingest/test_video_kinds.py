@@ -86,7 +86,7 @@ def test_an_animated_gif_is_a_video_and_a_single_picture_is_none(tmp_path: Path)
     assert find_source(tmp_path / "walk.gif") == "video"
     assert len(read_capture(tmp_path / "walk.gif", replace(CONFIG, video_fps=5.0)).shots) == 6
     frames[0].save(tmp_path / "one.png")
-    with pytest.raises(UserError, match=r"one\.png: is a single picture; give the folder"):
+    with pytest.raises(UserError, match=r"one\.png: is one picture; give the folder"):
         read_capture(tmp_path / "one.png", CONFIG)
 
 
