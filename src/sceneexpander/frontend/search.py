@@ -81,7 +81,8 @@ class CameraSearch:
             refine = self._finish(guided, refine)
             model = guided
         if refine:  # with a focal that is held and a little wrong, halves differ by that
-            model.halves_deg = halves_apart_deg(model, tracks, self._free_views(model))
+            apart = halves_apart_deg(model, tracks, self._free_views(model))
+            model.halves_deg = np.where(self.plan.generated, 0.0, apart)  # whether those fit is asked elsewhere
             return model, FocalSource.REFINED
         if self.plan.refine:
             others = [self._moved(model, sign * start.sigma) for sign in (-1, 1)]
