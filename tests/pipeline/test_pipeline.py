@@ -223,7 +223,7 @@ def test_expand_refuses_before_it_runs_anything(
     finished: Project, tmp_path: Path, arguments: list[str], said: str
 ) -> None:
     filled = [item.format(tmp=tmp_path, scene=finished.folder / "scenes" / "room") for item in arguments]
-    done = finished.run("-m", "sceneexpander.expand", *filled, check=False)
+    done = finished.run("-m", "sceneexpander.cli.expand", *filled, check=False)
     assert done.returncode == 2, done.stderr
     assert said in done.stderr
     assert done.stderr.strip().count("\n") == 0, "one line"
@@ -248,7 +248,7 @@ def mine(finished: Project) -> tuple[Path, str]:
     params.write_text(yaml.safe_dump(yaml.safe_load(before) | {"methods": [*ROWS]}))
     runs = finished.runs()
     try:
-        done = finished.run("-m", "sceneexpander.expand", str(photos), *arguments)
+        done = finished.run("-m", "sceneexpander.cli.expand", str(photos), *arguments)
     finally:
         params.write_text(before)
     assert finished.runs() == runs + len(ROWS), "runs of a workspace are tracked in the project"
@@ -267,7 +267,7 @@ def test_a_round_is_added_and_taken_back(finished: Project, mine: tuple[Path, st
     run, _ = mine
 
     def grow(*arguments: str) -> tuple[set[str], str]:
-        done = finished.run("-m", "sceneexpander.expand", "--continue", "mine", *arguments)
+        done = finished.run("-m", "sceneexpander.cli.expand", "--continue", "mine", *arguments)
         return set(re.findall(r"Running stage '([^']+)'", done.stdout)), done.stdout
 
     def content(folder: Path) -> dict[str, bytes]:
@@ -286,7 +286,7 @@ def test_a_round_is_added_and_taken_back(finished: Project, mine: tuple[Path, st
     assert "Drift of every region" in html
     assert "Where the camera could go next" in html
 
-    proposed = finished.run("-m", "sceneexpander.expand", "--continue", "mine", "--propose").stdout
+    proposed = finished.run("-m", "sceneexpander.cli.expand", "--continue", "mine", "--propose").stdout
     assert all(Path(place).is_file() for place in re.findall(r": (/.*\.png)", proposed))
     undone, _ = grow("--undo")
     assert undone == {"resolve@mine", "track"}, "the rest comes from the cache"
