@@ -39,7 +39,7 @@ def test_expand_refuses_before_it_runs_anything(
     project: Project, tmp_path: Path, arguments: list[str], said: str
 ) -> None:
     filled = [item.format(tmp=tmp_path, scene=project.folder / "scenes" / "room") for item in arguments]
-    done = project.run("-m", "sceneexpander.expand", *filled, check=False)
+    done = project.run("-m", "sceneexpander.cli.expand", *filled, check=False)
     assert done.returncode == 2, done.stderr
     assert said in done.stderr
     assert done.stderr.strip().count("\n") == 0, "one line"
@@ -63,7 +63,7 @@ def mine(project: Project) -> tuple[Path, str]:
     before = params.read_text()
     params.write_text(yaml.safe_dump(yaml.safe_load(before) | {"methods": [*ROWS]}))
     try:
-        done = project.run("-m", "sceneexpander.expand", str(photos), *arguments)
+        done = project.run("-m", "sceneexpander.cli.expand", str(photos), *arguments)
     finally:
         params.write_text(before)
     assert project.runs() == len(ROWS), "runs of a workspace are tracked in the project"
@@ -82,7 +82,7 @@ def test_a_round_is_added_and_taken_back(project: Project, mine: tuple[Path, str
     run, _ = mine
 
     def grow(*arguments: str) -> tuple[set[str], str]:
-        done = project.run("-m", "sceneexpander.expand", "--continue", "mine", *arguments)
+        done = project.run("-m", "sceneexpander.cli.expand", "--continue", "mine", *arguments)
         return set(re.findall(r"Running stage '([^']+)'", done.stdout)), done.stdout
 
     def content(folder: Path) -> dict[str, bytes]:
@@ -101,7 +101,7 @@ def test_a_round_is_added_and_taken_back(project: Project, mine: tuple[Path, str
     assert "Drift of every region" in html
     assert "Where the camera could go next" in html
 
-    proposed = project.run("-m", "sceneexpander.expand", "--continue", "mine", "--propose").stdout
+    proposed = project.run("-m", "sceneexpander.cli.expand", "--continue", "mine", "--propose").stdout
     assert all(Path(place).is_file() for place in re.findall(r": (/.*\.png)", proposed))
     undone, _ = grow("--undo")
     assert undone == {"resolve@mine", "track"}, "the rest comes from the cache"

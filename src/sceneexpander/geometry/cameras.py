@@ -75,6 +75,10 @@ class Cameras:
         """The same on a device."""
         return Cameras(self.world_from_cam.to(device), self.intrinsics_px.to(device), self.height, self.width)
 
+    def double(self) -> Cameras:
+        """The same in double precision."""
+        return Cameras(self.world_from_cam.double(), self.intrinsics_px.double(), self.height, self.width)
+
     def followed_by(self, others: Cameras) -> Cameras:
         """These cameras, then others of the same picture size.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander import ablation
+from sceneexpander.cli import ablation
 from sceneexpander.expandbench.document import READING, Results, written
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings
 from sceneexpander.expandbench.studies import STUDIES

@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from sceneexpander.cli.expand import parse_arguments, stage_scene
 from sceneexpander.errors import UserError
-from sceneexpander.expand import parse_arguments, stage_scene
 from sceneexpander.ingest import IngestConfig, load_photos, load_scene, make_round
 from sceneexpander.ingest.config import CameraAxes
 from sceneexpander.ingest.depth_files import DepthFile, DepthFormat

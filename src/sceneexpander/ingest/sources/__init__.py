@@ -13,7 +13,7 @@ from sceneexpander.errors import UserError, did_you_mean, printable
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.formats import kind_of_file, name_of_content, read_head, sniff_format
 from sceneexpander.ingest.sources.camera_files import CameraParams, CameraTexts, SevenScenes
-from sceneexpander.ingest.sources.capture import Capture, Shot, Source, named
+from sceneexpander.ingest.sources.capture import Capture, Shot, Source, name_some
 from sceneexpander.ingest.sources.colmap import ColmapModel
 from sceneexpander.ingest.sources.metashape import MetashapeCameras
 from sceneexpander.ingest.sources.photos import PhotoFolder
@@ -88,11 +88,11 @@ def read_capture(place: Path, config: IngestConfig, name: str = AUTO, *, where: 
         below = _captures_below(place)
         if not below:
             raise
-        problem = f"holds no pictures itself, but captures in folders of their own: {named(below)}"
+        problem = f"holds no pictures itself, but captures in folders of their own: {name_some(below)}"
         raise NoPicturesError(problem, where=place, fix="pass one of these folders") from None
     unused = _masks_of_nothing(place, capture)
     if unused:
-        capture = replace(capture, notes=(*capture.notes, f"masks of no picture that is used: {named(unused)}"))
+        capture = replace(capture, notes=(*capture.notes, f"masks of no picture that is used: {name_some(unused)}"))
     return capture.thinned(config.max_views)
 
 

@@ -13,7 +13,7 @@ from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.depth_files import DepthFile, depth_file
 from sceneexpander.ingest.jsonfile import read_user_json
 from sceneexpander.ingest.lens_models import Lens
-from sceneexpander.ingest.sources.capture import Capture, Shot, named, number_array, rigid_pose
+from sceneexpander.ingest.sources.capture import Capture, Shot, name_some, number_array, rigid_pose
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.survey import MASKS_FOLDER, list_pictures, natural_key
 from sceneexpander.plainfiles import read_plain_file
@@ -54,7 +54,7 @@ class SevenScenes:
             shots.append(Shot(name=path.name, picture=path, world_from_cam=pose))
         if not shots:
             raise UserError("holds no frame-XXXXXX.color.png", where=place)
-        notes = (f"frames whose pose is not finite are taken without one: {named(lost)}",) if lost else ()
+        notes = (f"frames whose pose is not finite are taken without one: {name_some(lost)}",) if lost else ()
         return Capture(shots=tuple(shots), notes=notes, files=tuple(files), metric=True, chosen=True)
 
 
@@ -99,7 +99,9 @@ class CameraTexts:
                 )
             )
         notes = (
-            (f"cameras of pictures that are not there: {named([printable(name) for name in known])}",) if known else ()
+            (f"cameras of pictures that are not there: {name_some([printable(name) for name in known])}",)
+            if known
+            else ()
         )
         return Capture(shots=tuple(shots), notes=notes, files=tuple(files), chosen=True)
 

@@ -17,7 +17,7 @@ from sceneexpander.errors import UserError, printable
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.depth_files import DepthFile, DepthFormat
 from sceneexpander.ingest.lens_models import Lens, Projection
-from sceneexpander.ingest.sources.capture import Capture, Shot, member, named, number_array, rigid_pose
+from sceneexpander.ingest.sources.capture import Capture, Shot, member, name_some, number_array, rigid_pose
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.survey import MASKS_FOLDER, natural_key
 from sceneexpander.plainfiles import read_plain_file
@@ -146,12 +146,12 @@ class ColmapModel:
                 )
             )
         if not shots:
-            raise UserError(f"lists {named(missing)}, none of which is there", where=images_file, fix="add images/")
+            raise UserError(f"lists {name_some(missing)}, none of which is there", where=images_file, fix="add images/")
         notes = []
         if missing:
-            notes.append(f"{len(missing)} of {len(images)} pictures of the model are not there: {named(missing)}")
+            notes.append(f"{len(missing)} of {len(images)} pictures of the model are not there: {name_some(missing)}")
         if len(folders) > 1 and not eth3d:
-            others = named([other.relative_to(place).as_posix() for other in folders if other != folder])
+            others = name_some([other.relative_to(place).as_posix() for other in folders if other != folder])
             notes.append(f"the model in {folder.relative_to(place).as_posix()} is used; there is also {others}")
         if eth3d and (place / _ETH3D_DEPTH).is_dir() and not any(shot.depth for shot in shots):
             notes.append(

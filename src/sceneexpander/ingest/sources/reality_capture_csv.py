@@ -20,7 +20,7 @@ from sceneexpander.errors import UserError, printable
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.decode import read_picture_header
 from sceneexpander.ingest.lens_models import Lens
-from sceneexpander.ingest.sources.capture import Capture, Shot, named, number_array, rigid_pose
+from sceneexpander.ingest.sources.capture import Capture, Shot, name_some, number_array, rigid_pose
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.sources.reality_capture import make_lens
 from sceneexpander.ingest.survey import MASKS_FOLDER, list_pictures, natural_key
@@ -60,7 +60,7 @@ class RealityCaptureCsv:
             mask = mask_of(picture.name, place / MASKS_FOLDER)
             shots.append(Shot(name=picture.name, picture=picture, lens=lens, world_from_cam=pose, mask=mask))
         left = [printable(name) for name in sorted(cameras, key=natural_key)]
-        notes = (f"cameras of pictures that are not there: {named(left)}",) if left else ()
+        notes = (f"cameras of pictures that are not there: {name_some(left)}",) if left else ()
         return Capture(shots=tuple(shots), notes=notes, files=(path,), chosen=True)
 
 

@@ -20,11 +20,11 @@ from typing import Any
 import pytest
 import yaml
 
-from sceneexpander import expand as command
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
 from sceneexpander.artifacts.page import BaseModel, ScenePage
+from sceneexpander.cli import expand as command
+from sceneexpander.cli.expand import Request, expand, run_name, stage_scene
 from sceneexpander.errors import UserError, printable
-from sceneexpander.expand import Request, expand, run_name, stage_scene
 from sceneexpander.generation import Forecast
 from sceneexpander.pipeline import preflight
 from sceneexpander.pipeline.locks import run_lock
