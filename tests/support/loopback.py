@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from websockets.datastructures import Headers
+from websockets.http11 import Request
+from websockets.server import ServerProtocol
 
 
 @dataclass(slots=True)
@@ -48,6 +51,9 @@ class Service:
         self.answers: list[Answer] = []
         self.asked: list[Asked] = []
         self.route: Callable[[Asked], Answer | None] = lambda _: None
+        self.pushed: list[
+            str | bytes
+        ] = []  # messages for everybody who opens a WebSocket; none: there are no WebSockets
 
     def answer(self, request: Asked) -> Answer:
         """The next one."""
@@ -66,6 +72,10 @@ def serving() -> Iterator[Service]:
         def _serve(self) -> None:
             body = self.rfile.read(int(self.headers.get("content-length") or 0))
             headers = {name.lower(): value for name, value in self.headers.items()}
+            if headers.get("upgrade") == "websocket" and service.pushed:
+                service.asked.append(Asked(method=self.command, path=self.path, headers=headers, body=body))
+                self._push()
+                return
             answer = service.answer(Asked(method=self.command, path=self.path, headers=headers, body=body))
             time.sleep(answer.wait_s)
             self.send_response(answer.status)
@@ -74,6 +84,18 @@ def serving() -> Iterator[Service]:
             self.send_header("content-length", str(len(answer.body)))
             self.end_headers()
             self.wfile.write(answer.body[: len(answer.body) // 2] if answer.cut else answer.body)
+
+        def _push(self) -> None:
+            protocol = ServerProtocol()
+            protocol.send_response(protocol.accept(Request(self.path, Headers(self.headers.items()))))
+            for message in service.pushed:
+                if isinstance(message, bytes):
+                    protocol.send_binary(message)
+                else:
+                    protocol.send_text(message.encode())
+            self.wfile.write(b"".join(protocol.data_to_send()))
+            self.rfile.read(2)  # until the client closes
+            self.close_connection = True
 
         do_GET = do_POST = _serve
 

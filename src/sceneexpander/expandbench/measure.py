@@ -40,7 +40,13 @@ class BenchNumbers:
         return self.values.get(name)
 
 
-def measure(reconstruction: Reconstruction, views: ViewSet, truth: SceneTruth, scene: BenchScene) -> BenchNumbers:
+def measure(
+    reconstruction: Reconstruction,
+    views: ViewSet,
+    truth: SceneTruth,
+    scene: BenchScene,
+    config: EvaluateConfig | None = None,
+) -> BenchNumbers:
     """Measure a reconstruction of the scene's captured views, with or without the inserted one.
 
     Args:
@@ -48,11 +54,12 @@ def measure(reconstruction: Reconstruction, views: ViewSet, truth: SceneTruth, s
         views: pictures of at least the reconstruction's views.
         truth: of those views, see `BenchScene.insert`.
         scene: the scene.
+        config: what else is measured; None: everything.
     """
     row = evaluate(
         reconstruction,
         views,
-        EvaluateConfig(),
+        EvaluateConfig() if config is None else config,
         scene=scene.name,
         round_number=1,
         seed=0,

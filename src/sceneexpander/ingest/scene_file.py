@@ -151,9 +151,8 @@ def make_round(prompt: str, *, motion: str = "", new_object: str = "", where: st
     prompt, motion, new_object = (_checked_words(text, where) for text in (prompt, motion, new_object))
     sentence = prompt or "; ".join(part for part in (motion, new_object) if part)
     if not sentence:
-        raise UserError(
-            "has no prompt", where=where, fix='say what to add, e.g. prompt: "Behind the table is a bench."'
-        )
+        option = "--prompt " if where.startswith("--") else "prompt: "
+        raise UserError("has no prompt", where=where, fix=f'say what to add, e.g. {option}"Step back, a wooden bench."')
     return RoundSpec(prompt=sentence, motion=motion, new_object=new_object)
 
 

@@ -168,3 +168,33 @@ def test_every_gradient_equals_the_one_worked_out_by_hand(
     loss(ViewGeometry(**leaves), target, config).total.backward()
     for name, expected in _written_out_gradients(student, target, weight_d, weight_n, huber, kind).items():
         np.testing.assert_allclose(leaves[name].grad.numpy(), expected, rtol=1e-11, atol=1e-14)
+
+
+@pytest.mark.parametrize("kind", [*DepthDistance, None])
+@pytest.mark.parametrize("scale", [1.0, 0.05])
+def test_a_weight_of_three_is_the_pixel_three_times(kind: DepthDistance | None, scale: float) -> None:
+    """And only the ratio of weights counts. ``None``: normals."""
+    student, target = _geometry(30), _geometry(31)
+    times = torch.tensor([[1, 3, 0, 2, 1]]).repeat(H, 1)
+    weights = (scale * times.double()).expand(VIEWS, H, W)
+
+    def repeated(values: torch.Tensor) -> torch.Tensor:
+        return values.repeat_interleave(times[0], dim=2)
+
+    if kind is None:
+        plain = normal_distance(repeated(student.normals), repeated(target.normals))
+        weighted = normal_distance(student.normals, target.normals, weights)
+    else:
+        plain = depth_distance(repeated(student.depth), repeated(target.depth), kind)
+        weighted = depth_distance(student.depth, target.depth, kind, weights)
+    torch.testing.assert_close(weighted, plain)
+
+
+def test_weights_of_pixels_are_no_weights_of_the_camera() -> None:
+    student, target = _geometry(32).view(0, 1), _geometry(33).view(0, 1)
+    weights = torch.rand(1, H, W, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    plain = generation_loss(student, target, AdaptConfig())
+    weighted = generation_loss(student, target, AdaptConfig(), weights)
+    assert float(weighted.camera) == float(plain.camera)
+    assert float(weighted.depth) != float(plain.depth)
+    assert float(weighted.normal) != float(plain.normal)

@@ -102,6 +102,28 @@ def test_targets_follow_the_frame_and_the_scale_of_a_new_first_view(factor: floa
     assert float(anchor_loss(student, targets, config).total) < 1e-5
 
 
+@pytest.mark.parametrize("factor", [0.4, 3.0])
+def test_gaussians_grow_with_the_scene_and_stay_as_solid(factor: float) -> None:
+    """In the scale of a new first view: opacities as they were, logarithms of sizes moved by the scale's. The inserted view has no say."""
+    draw = torch.Generator().manual_seed(6)
+    anchors, chosen = replace(geometry(0), splats=torch.randn(VIEWS, H, W, 4, generator=draw)), (1, 3, 4)
+    held = anchors.splats
+    assert held is not None
+    grown = torch.cat([held[..., :1], held[..., 1:] + torch.tensor(factor).log()], dim=-1)[list(chosen)]
+    other = geometry(3, 1)
+    student = replace(
+        geometry(1, 4),
+        depth=torch.cat([anchors.depth[list(chosen)] * factor, other.depth * 50]),
+        splats=torch.cat([grown, grown[:1]]),
+    )
+    targets = anchor_targets(
+        anchors, Batch(captured=chosen, inserted=True), [None] * 3, student, AdaptConfig(gauge=Gauge.REALIGN)
+    )
+    assert targets.splats is not None
+    torch.testing.assert_close(targets.splats, grown)
+    torch.testing.assert_close(targets.depth, student.depth[:3])
+
+
 def test_the_gauge_is_kept_while_the_first_view_is_there() -> None:
     """A student in another scale than the anchors is then a loss, as in the paper."""
     anchors, batch = geometry(0), Batch(captured=(0, 2), inserted=False)

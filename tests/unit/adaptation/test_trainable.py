@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -117,14 +118,50 @@ def test_the_plateau_compares_windows(anchors: list[float], stops: bool) -> None
     config = AdaptConfig(plateau=PlateauConfig(window=2, tolerance=0.1), lambda_gen=0.0)
     # The number of views changes from step to step and must not matter.
     records = [_record(i + 1, value, None, captured=2 + i % 3) for i, value in enumerate(anchors)]
-    assert plateau.reached(records, config) == stops
+    assert plateau.has_plateaued(records, config) == stops
 
 
 def test_the_plateau_waits_until_the_inserted_view_was_seen() -> None:
     config = AdaptConfig(plateau=PlateauConfig(window=1), lambda_gen=1.0)
-    assert not plateau.reached([_record(1, 1.0, 1.0), _record(2, 1.0, None)], config)
-    assert plateau.reached([_record(1, 1.0, 1.0), _record(2, 1.0, 1.0)], config)
-    assert not plateau.reached([_record(1, 1.0, 1.0), _record(2, 1.0, 0.5)], config)
+    assert not plateau.has_plateaued([_record(1, 1.0, 1.0), _record(2, 1.0, None)], config)
+    assert plateau.has_plateaued([_record(1, 1.0, 1.0), _record(2, 1.0, 1.0)], config)
+    assert not plateau.has_plateaued([_record(1, 1.0, 1.0), _record(2, 1.0, 0.5)], config)
+
+
+@pytest.mark.parametrize("insertion", [0.0, 0.5])
+def test_windows_are_compared_by_what_the_objective_weighs(insertion: float) -> None:
+    """All terms count, each of a view as the objective has it, and the last two windows alone."""
+    config = AdaptConfig(
+        plateau=PlateauConfig(window=3, tolerance=0.25),
+        lambda_anchor=2.0,
+        lambda_gen=3.0,
+        insertion_probability=insertion,
+    )
+    draw, answers = np.random.default_rng(0), set()
+    for _ in range(60):
+        records = []
+        for step in range(1, 13):
+            terms = {
+                f"{loss}_{part}": float(draw.uniform())
+                for loss in ("anchor", "gen")
+                for part in ("camera", "depth", "normal")
+            }
+            seen = step % 3 == 0 or bool(draw.integers(2))
+            records.append(
+                replace(_record(step, 0.0, 1.0 if seen else None, captured=int(draw.integers(2, 5))), **terms)
+            )
+        last, before = records[-3:], records[-6:-3]
+
+        def level(window: list[StepRecord]) -> float:
+            anchor = [(one.anchor_camera + one.anchor_depth + one.anchor_normal) / one.captured for one in window]
+            gen = [one.gen_camera + one.gen_depth + one.gen_normal for one in window if one.inserted]
+            return 2.0 * float(np.mean(anchor)) + (3.0 * float(np.mean(gen)) if insertion else 0.0)
+
+        falls = level(last) <= 0.75 * level(before)
+        assert plateau.reached(records, config) == (not falls)
+        assert not plateau.reached(records[:-1], config), "asked once per window"
+        answers.add(falls)
+    assert answers == {True, False}
 
 
 def test_stopping_early_reports_the_steps_saved_and_looks_once_more() -> None:

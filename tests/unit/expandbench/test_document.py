@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander.ablation import make_plan
 from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.cli.ablation import make_plan
 from sceneexpander.errors import UserError
 from sceneexpander.expandbench.document import READING, Measured, Results, document, powerless, written
 from sceneexpander.expandbench.grades import GRADES
 from sceneexpander.expandbench.run import BASELINE, CAPTURED
-from sceneexpander.expandbench.scenes import ABLATION_TEST, DEVELOPMENT, SCENES, TEST
+from sceneexpander.expandbench.scenes import ABLATION_TEST, CHECK, DEVELOPMENT, SCENES, TEST
 from sceneexpander.expandbench.studies import STUDIES
 from sceneexpander.insertion.contradiction import Contradiction
 from tests.support.methods import make_method
@@ -117,6 +117,7 @@ def test_test_scenes_are_others_and_only_the_study_of_that_name_uses_them() -> N
     assert not set(DEVELOPMENT) & set(TEST)
     assert set(SCENES) == {*DEVELOPMENT, *TEST}
     assert {SCENES[name][1] for name in DEVELOPMENT}.isdisjoint({SCENES[name][1] for name in TEST})
+    assert {int(name.rpartition("_")[2]) for name in CHECK}.isdisjoint({seed for _, seed in SCENES.values()})
     for study in STUDIES:
         assert set(study.scenes) <= set(TEST if study.name == "test" else DEVELOPMENT)
         assert set(study.grades) <= set(GRADES)

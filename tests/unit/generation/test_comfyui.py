@@ -57,6 +57,8 @@ class Comfy:
             image = {"filename": f"{run}.png", "subfolder": "", "type": "output"}
             done = {"outputs": {"4": {"images": [image]}}, "status": {"status_str": "success", "completed": True}}
             return said({} if self.polled % 3 else {run: done})
+        if path == "/ws":
+            return said({}, 404)
         if path == "/queue":
             return said({"queue_running": [], "queue_pending": []})
         assert path == "/view"
@@ -134,6 +136,50 @@ def test_where_the_workflow_stands_is_said_once(
     told = [record.getMessage() for record in caplog.records if record.getMessage().startswith("ComfyUI: ")]
     assert len(told) == (words is not None)
     assert words is None or words in told[0]
+
+
+def progress(run: str, value: object, most: object = 20, node: object = "3") -> str:
+    return json.dumps({"type": "progress", "data": {"value": value, "max": most, "prompt_id": run, "node": node}})
+
+
+def executing(node: object) -> str:
+    return json.dumps({"type": "executing", "data": {"node": node, "prompt_id": "run1"}})
+
+
+@pytest.mark.parametrize(
+    ("pushed", "words"),
+    [
+        ([progress("run1", 1), progress("run1", 7), progress("other", 9)], ["SX_SEED: step 7 of 20"]),
+        ([executing("9"), b"a preview" * 99, executing(None)], ["node 9"]),
+        ([executing("5")], ["CLIPTextEncode"]),
+        (['{"type": "status", "data": {"sid": "x"}}', "[", "[" * 9999, "7", '{"data": 1}'], []),
+        ([progress("run1", "?"), progress("run1", 1, None), progress("run1", 2, 3, [])[:40]], []),
+    ],
+)
+def test_the_steps_that_the_server_pushes_are_said(
+    pushed: list[str | bytes], words: list[str], comfy: Comfy, so_far: SceneSoFar, context: GenerationContext,
+    tmp_path: Path, caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    comfy.service.pushed = pushed
+    with caplog.at_level(logging.INFO):
+        made = generator(comfy, tmp_path, "generator.candidates=1").generate(context, so_far)
+    assert made.candidates[0].data == drawn(1)
+    assert [r.getMessage().removeprefix("ComfyUI: ") for r in caplog.records if "ComfyUI: " in r.getMessage()] == words
+    opened = next(item.path for item in comfy.service.asked if item.path.startswith("/ws"))
+    queued = next(json.loads(item.body) for item in comfy.service.asked if item.path == "/prompt")
+    assert opened == f"/ws?clientId={queued['client_id']}", "messages of a run go to who queued it"
+
+
+@pytest.mark.parametrize("pushed", [[], ["x" * 2**16] * 3])
+def test_without_steps_the_picture_comes_all_the_same(
+    pushed: list[str | bytes], comfy: Comfy, so_far: SceneSoFar, context: GenerationContext, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Of a server that refuses WebSockets, or sends more than is read, nothing is lost but the steps."""
+    monkeypatch.setattr("sceneexpander.generation.backends.comfyui_steps._LARGEST_MESSAGE", 2**10)
+    comfy.service.pushed = pushed
+    made = generator(comfy, tmp_path, "generator.candidates=1").generate(context, so_far)
+    assert made.candidates[0].data == drawn(1)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from sceneexpander.errors import UserError
+from sceneexpander.generation.backends.comfyui_steps import Steps, listening
 from sceneexpander.generation.config import ServiceConfig, picture_path
 from sceneexpander.generation.service import Question, Reply, ServiceGenerator, plain_settings
 from sceneexpander.plainfiles import read_plain_file
@@ -28,6 +29,7 @@ logger = logging.getLogger(__name__)
 _LARGEST_WORKFLOW = 16 * 2**20
 _TEXTS, _SEEDS = ("text", "prompt", "value", "string"), ("seed", "noise_seed", "value")
 _POLL_S = 0.5
+_SAY_S = 5.0  # steps of a fast server are not all said
 _CONNECT_S = 10.0
 
 Workflow = dict[str, Any]
@@ -96,17 +98,20 @@ class ComfyUIService:
             images[title] = "/".join(part for part in (uploaded.get("subfolder"), uploaded.get("name")) if part)
         seed = self.config.seed + question.number
         filled = fill_workflow(workflow, prompt=question.prompt, seed=seed, images=images)
-        queued = self._json("POST", "/prompt", json={"prompt": filled})
-        run = queued.get("prompt_id")
-        if not isinstance(run, str):
-            raise ServiceError("failed_final", "the server queued nothing", fix="try the workflow in ComfyUI itself")
-        place = self._finished(run, workflow, deadline)
+        with listening(self.config.base_url) as steps:
+            queued = self._json("POST", "/prompt", json={"prompt": filled, "client_id": steps.client_id})
+            run = queued.get("prompt_id")
+            if not isinstance(run, str):
+                fix = "try the workflow in ComfyUI itself"
+                raise ServiceError("failed_final", "the server queued nothing", fix=fix)
+            place = self._finished(run, workflow, steps, deadline)
         response = self._request("GET", "/view", params=place)
         return Reply(data=response.content, model="ComfyUI workflow", request_id=run, parameters={"seed": str(seed)})
 
-    def _finished(self, run: str, workflow: Workflow, deadline: float) -> dict[str, str]:
+    def _finished(self, run: str, workflow: Workflow, steps: Steps, deadline: float) -> dict[str, str]:
         """Where the run's picture lies on the server, once it is there. What becomes of it until then is said."""
-        shown = ""
+        shown, step, next_step_s = "", "", 0.0
+        names = {key: str(node.get("class_type", f"node {key}")) for key, node in workflow.items()} | titles(workflow)
         while True:
             entry = self._json("GET", f"/history/{run}").get(run)
             status = entry.get("status", {}) if isinstance(entry, dict) else {}
@@ -124,7 +129,10 @@ class ComfyUIService:
             if words and words != shown:
                 logger.info("ComfyUI: %s", words)
                 shown = words
-            time.sleep(_POLL_S)
+            step = steps.wait(_POLL_S, run, names) or step
+            if step and time.monotonic() >= next_step_s:
+                logger.info("ComfyUI: %s", step)
+                step, next_step_s = "", time.monotonic() + _SAY_S
 
     def _progress(self, run: str) -> str:
         """Where a run stands in the server's queue, in words; empty if the server does not say."""

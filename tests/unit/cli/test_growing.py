@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 import yaml
 
-from sceneexpander import expand as command
-from sceneexpander import growing
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
+from sceneexpander.cli import expand as command
+from sceneexpander.cli import growing
+from sceneexpander.cli.expand import expand, parse_arguments, read_arguments
+from sceneexpander.cli.growing import RoundRequest, add_round, proposal_lines, quality_line, undo_round
 from sceneexpander.errors import UserError
-from sceneexpander.expand import expand, parse_arguments, read_arguments
 from sceneexpander.generation import Forecast
-from sceneexpander.growing import RoundRequest, add_round, proposal_lines, quality_line, undo_round
 from sceneexpander.pipeline.preflight import CheckedScene
 from sceneexpander.pipeline.selection import read_selection
 from tests.worlds.expansions import everything, photos, picture, project, request, somebody_at_work
@@ -124,7 +124,7 @@ def test_the_first_command_again_loses_no_added_round(run: Path, project: Path, 
     [
         ("rom", LEFT, "--continue: there is no run 'rom'; did you mean 'room'"),
         ("room", RoundRequest(), "--prompt: says not what to add; room is finished; add --prompt or --undo"),
-        ("room", RoundRequest(settings=LEFT.settings), "--prompt: has no prompt"),
+        ("room", RoundRequest(settings=LEFT.settings), '--prompt: has no prompt; say what to add, e.g. --prompt "'),
         ("room", RoundRequest(prompt="A lake."), "--inserted: the new round has no picture"),
         (
             "room",
