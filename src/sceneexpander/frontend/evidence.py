@@ -29,6 +29,9 @@ _MIN_MATCHES = 30  # fewer say nothing about a camera
 _FOCAL_STEPS = (0.02, 0.01, 0.005)
 _SHIFT_STEPS = (0.02,)
 _STILL_FITS = 1.15  # times what is unexplained at the best focal
+# The same for another explanation of a flat surface. Where there is next to no relief, the wrong one of the two was seen to fit 1.2 times as
+# well as the right one, given the lens; right poses of pairs with relief had no rival under 1.4.
+_RIVAL_FITS = 1.25
 _NOISE_PX = 0.5  # at 768 px: systematic errors of keypoints that the scatter of their errors does not show
 
 
@@ -285,7 +288,7 @@ def _rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], 
         others[0],
         mapping.intrinsics[view],
         threshold_px=mapping.config.epipolar_px * mapping.unit_px,
-        still_fits=_STILL_FITS,
+        still_fits=_RIVAL_FITS,
         seed=mapping.seed,
     )
 
