@@ -24,7 +24,7 @@ SHELLS = {
 YAML = {f"yaml.{name}" for name in ("load", "load_all", "full_load", "full_load_all", "unsafe_load", "unsafe_load_all")}
 # The reader of checkpoints has an unpickler of its own, that knows a closed list of names; the other names an error.
 ALLOWED = {
-    "src/sceneexpander/convert_checkpoint.py": {"import pickle"},
+    "src/sceneexpander/cli/convert_checkpoint.py": {"import pickle"},
     "src/sceneexpander/evaluation/visual.py": {"import pickle.UnpicklingError"},
     "src/sceneexpander/config/files.py": {"yaml.load"},  # with a safe loader, see below
     "src/sceneexpander/cli/completion.py": {"shtab.complete(shell)"},  # the name of the shell that completes words

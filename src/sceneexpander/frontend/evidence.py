@@ -29,8 +29,8 @@ _MIN_MATCHES = 30  # fewer say nothing about a camera
 _FOCAL_STEPS = (0.02, 0.01, 0.005)
 _SHIFT_STEPS = (0.02,)
 _STILL_FITS = 1.15  # times what is unexplained at the best focal
-# The same for another explanation of a flat surface. Where there is next to no relief, the wrong one of the two was seen to fit 1.2 times as
-# well as the right one, given the lens; right poses of pairs with relief had no rival under 1.4.
+# The same for another explanation of a flat surface. Where there is next to no relief, the right one of the two was seen to leave 1.2 times
+# what the wrong one does, with the lens given; right poses of pairs with relief had no rival under 1.4.
 _RIVAL_FITS = 1.25
 _NOISE_PX = 0.5  # at 768 px: systematic errors of keypoints that the scatter of their errors does not show
 

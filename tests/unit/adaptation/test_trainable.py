@@ -158,8 +158,8 @@ def test_windows_are_compared_by_what_the_objective_weighs(insertion: float) -> 
             return 2.0 * float(np.mean(anchor)) + (3.0 * float(np.mean(gen)) if insertion else 0.0)
 
         falls = level(last) <= 0.75 * level(before)
-        assert plateau.reached(records, config) == (not falls)
-        assert not plateau.reached(records[:-1], config), "asked once per window"
+        assert plateau.has_plateaued(records, config) == (not falls)
+        assert not plateau.has_plateaued(records[:-1], config), "asked once per window"
         answers.add(falls)
     assert answers == {True, False}
 

@@ -140,7 +140,14 @@ def filled(path: str) -> str:
         ),
         ("render", [layout.renders("S", 2, "backbone"), layout.statistics("render", "S", 2, "backbone")]),
         ("pack", [layout.packed("S", 2, "backbone"), layout.statistics("pack", "S", 2, "backbone")]),
-        ("evaluate", [layout.metrics("S", 2, "backbone"), layout.statistics("evaluate", "S", 2, "backbone")]),
+        (
+            "evaluate",
+            [
+                layout.metrics("S", 2, "backbone"),
+                layout.held_out_seen("S", 2, "backbone"),
+                layout.statistics("evaluate", "S", 2, "backbone"),
+            ],
+        ),
         ("judge", [layout.judged("S", 2), layout.statistics("judge", "S", 2)]),
         ("collect", [layout.PAGES / "S"]),
         ("report", [layout.REPORT, Path("results/metrics.json")]),

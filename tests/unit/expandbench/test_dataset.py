@@ -104,7 +104,7 @@ def test_the_sample_in_the_repository_is_what_is_generated(tmp_path: Path) -> No
 
 def test_depth_normals_poses_and_pictures_are_of_one_world(truth: TrueScene, drawn: DrawnScene) -> None:
     """Rays through the pixel centres, traced apart from the renderer, end where the depth says."""
-    world_from_first = torch.from_numpy(drawn.world_from_cam[0])
+    world_from_first = drawn.cameras.world_from_cam[0]
     for name in (CAPTURED_VIEWS[2], INTENDED, *HELD_OUT):
         view = truth.views[name]
         rows, columns = torch.meshgrid(torch.arange(3, 84, 9), torch.arange(4, 112, 9), indexing="ij")
@@ -140,11 +140,11 @@ def test_no_photograph_shows_the_expanded_region(bench: Path, drawn: DrawnScene)
     shown = {}
     for region in ("captured", "expanded"):
         points = _read_points(bench / NAME / "truth" / f"{region}.ply")[::3]
-        world = transform_points(torch.from_numpy(drawn.world_from_cam[0]), points).numpy()
+        world = transform_points(drawn.cameras.world_from_cam[0], points).numpy()
         seen = np.zeros(len(world), dtype=bool)
-        for pose in drawn.world_from_cam[: len(CAPTURED_VIEWS)]:
+        for pose in drawn.cameras.world_from_cam[: len(CAPTURED_VIEWS)].numpy():
             local = (world - pose[:3, 3]) @ pose[:3, :3]
-            pixel = local @ drawn.intrinsics_px.T / np.maximum(local[:, 2:], 1e-6)
+            pixel = local @ drawn.cameras.intrinsics_px[0].numpy().T / np.maximum(local[:, 2:], 1e-6)
             inside = (local[:, 2] > 0) & (pixel[:, :2] > 0).all(1) & (pixel[:, :2] < [112, 84]).all(1)
             rays = (world - pose[:3, 3]).astype(np.float32)
             first = trace_rays(drawn.world, np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape), rays)

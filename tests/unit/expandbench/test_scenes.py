@@ -78,7 +78,7 @@ def test_a_perfect_insertion_is_the_intended_view(scene: BenchScene) -> None:
 
 
 def test_cameras_look_beyond_the_captured_boundary(scene: BenchScene) -> None:
-    poses = torch.from_numpy(scene.cameras)
+    poses = scene.cameras.world_from_cam
     turned = [float(rotation_angle_deg(pose[:3, :3], poses[-1, :3, :3])) for pose in poses[:-1]]
     assert min(turned) > 10
 
