@@ -122,7 +122,7 @@ nothing of the truth reaches a method. Finished cells are kept in `.cache/expand
 Prepared scenes stay there for the four codes and configurations used last.
 
 ```
-make ablation                                              # all studies below; the better part of a day on two cores
+make ablation                                              # all studies below; some three hours of one core
 make ablation ARGS="--study rows,long"                     # some of them
 make ablation ARGS="--finished"                            # nothing is run: the page from the cells that are there
 make ablation ARGS="--rows paper,default --grades mixed_2 --seeds 0"   # a table of your own, this page is left alone

@@ -59,10 +59,11 @@ def read_scene_file(folder: Path) -> SceneFile:
     if not isinstance(rounds, list) or not rounds:
         raise UserError("has no rounds", where=path, fix="add 'rounds:' with at least one '- prompt: ...'")
     images = _text(content, "images", path, "the file")
+    source, origin = _source_and_origin(content, path)
     return SceneFile(
         name=_text(content, "name", path, "the file") or None,
-        source=_source(content, path),
-        origin=_text(content, "origin", path, "the file"),
+        source=source,
+        origin=origin,
         licence=_text(content, "licence", path, "the file"),
         images=_existing(folder, images, f"{path}: 'images'") if images else "captured",
         order=_names(content.get("order"), path),
@@ -92,15 +93,15 @@ def _text(content: dict[str, Any], key: str, path: Path, what: str) -> str:
     return " ".join(value.split())
 
 
-def _source(content: dict[str, Any], path: Path) -> str:
-    name = _text(content, "source", path, "the file") or "auto"
-    if " " in name:
-        raise UserError(
-            f"'source' is {printable(name[:60])!r}, no kind of data",
-            where=path,
-            fix="write where it is from as 'origin: ...'",
-        )
-    return name
+def _source_and_origin(content: dict[str, Any], path: Path) -> tuple[str, str]:
+    """The kind of the data, and where it is from. A kind is one word; a sentence under ``source`` says the latter, as it did in 0.1.0."""
+    source, origin = (_text(content, key, path, "the file") for key in ("source", "origin"))
+    if " " not in source:
+        return source or "auto", origin
+    if origin:
+        problem = f"'source' is {printable(source[:60])!r}, no kind of data"
+        raise UserError(problem, where=path, fix="leave it out: 'origin' says where the data is from")
+    return "auto", source
 
 
 def _names(value: object, path: Path) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ from sceneexpander.ingest import (
     read_views,
     safe_name,
 )
+from sceneexpander.ingest.scene_file import read_scene_file
 from sceneexpander.ingest.survey import natural_key
 
 CONFIG = IngestConfig(long_side_px=56)
@@ -74,6 +75,16 @@ def test_scene_folder(tmp_path: Path) -> None:
     assert scene.rounds[1].prompt == "move back; a squirrel sits on a stone bench"
     assert (scene.rounds[1].motion, scene.rounds[1].new_object) == ("move back", "a squirrel sits on a stone bench")
     assert not bool(scene.views.generated.any())
+
+
+def test_a_sentence_as_source_says_where_the_data_is_from(tmp_path: Path) -> None:
+    """As in scene folders of 0.1.0; a kind is one word."""
+    folder = scene_folder(tmp_path / "a", "source: a museum's collection\nrounds: [{prompt: A cat.}]")
+    told = read_scene_file(folder)
+    assert (told.source, told.origin) == ("auto", "a museum's collection")
+    twice = scene_folder(tmp_path / "b", "source: a museum's collection\norigin: us\nrounds: [{prompt: A cat.}]")
+    with pytest.raises(UserError, match="'origin' says where the data is from"):
+        read_scene_file(twice)
 
 
 def test_saved_scene_is_the_loaded_scene(tmp_path: Path) -> None:
