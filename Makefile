@@ -53,23 +53,23 @@ test-slow: .venv/.stamp ## What `make test` leaves out for its length: lenses, m
 	OMP_NUM_THREADS=1 pytest tests/unit tests/pipeline -n 2 --dist worksteal -m slow
 
 ui: .venv/.stamp ## Runs in the browser (loopback only)
-	exec $(PY) -m sceneexpander.ui
+	exec $(PY) -m sceneexpander ui
 
 # make view SCENE=courtyard ROUND=1
 view: SCENE ?= courtyard
 view: ROUND ?= 1
 view: .venv/.stamp ## Walk through a scene in the browser (loopback only): SCENE=, ROUND=, ARGS=
-	exec $(PY) -m sceneexpander.viewer "outputs/$(SCENE)" --round "$(ROUND)" $(ARGS)
+	exec $(PY) -m sceneexpander view "outputs/$(SCENE)" --round "$(ROUND)" $(ARGS)
 
 # make expand PHOTOS=folder INSERTED=picture.png PROMPT="Behind the table is a bench."
 # The values reach the shell as environment variables, so quotes in a sentence need no escaping.
 export PHOTOS INSERTED PROMPT NAME
 expand: .venv/.stamp ## Expand your own photos: PHOTOS=, INSERTED=, PROMPT=, NAME=, ARGS=
 	@test -n "$$PHOTOS" || { echo 'error: PHOTOS: is missing; make expand PHOTOS=folder INSERTED=picture PROMPT="..."' >&2; exit 2; }
-	exec $(PY) -m sceneexpander.expand "$$PHOTOS" $(if $(INSERTED),--inserted "$$INSERTED") $(if $(PROMPT),--prompt "$$PROMPT") $(if $(NAME),--name "$$NAME") $(ARGS)
+	exec $(PY) -m sceneexpander expand "$$PHOTOS" $(if $(INSERTED),--inserted "$$INSERTED") $(if $(PROMPT),--prompt "$$PROMPT") $(if $(NAME),--name "$$NAME") $(ARGS)
 
 ablation: .venv/.stamp ## The rows of the paper's ablation table, controls and more, against known truth: ARGS=
-	exec $(PY) -m sceneexpander.ablation $(ARGS)
+	exec $(PY) -m sceneexpander ablation $(ARGS)
 
 mini-scores: .venv/.stamp ## Errors of the embedded reconstructor on made scenes
 	$(PY) scripts/mini_scores.py

@@ -14,7 +14,7 @@ import json
 import os
 import statistics
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -68,15 +68,14 @@ def run_scene(seed: int, args: argparse.Namespace) -> SceneResult:
         scene.images,
         scene.depth,
         scene.valid,
-        scene.world_from_cam,
-        scene.intrinsics_px,
+        scene.cameras,
         generator,
         per_view=(args.points_min, args.points_max),
     )
     poses = perturb_poses(scene.world_from_cam, args.pose_noise_deg, args.baseline_noise, generator)
     config = DenseConfig(threads=args.threads)
     start = time.process_time()
-    result = dense_depth(scene.images, poses, scene.intrinsics_px, sparse, config)
+    result = dense_depth(scene.images, replace(scene.cameras, world_from_cam=poses), sparse, config)
     seconds = time.process_time() - start
 
     interpolated = result.depth * result.evidence[:, EVIDENCE_CHANNELS.index("sparse")].exp()

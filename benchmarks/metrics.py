@@ -14,7 +14,6 @@ from sceneexpander.evaluation.evaluate import MEASURES
 from sceneexpander.evaluation.measure import Subject
 from sceneexpander.evaluation.views import see_views
 from sceneexpander.geometry.camera import camera_vector_from_pose, unproject_to_world
-from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians, sh_from_rgb
 from sceneexpander.geometry.trajectory import navigation
 from sceneexpander.synthetic import make_views
@@ -79,8 +78,7 @@ def main() -> None:
     height, width = round(given.side * 0.75 / 14) * 14, given.side
     scene, views = made_scene(given.views, height, width)
     config = EvaluateConfig(consistency_frames=8)
-    poses, lenses = navigation(scene.world_from_cam, scene.intrinsics_px, given.frames, range(given.views))
-    path = Cameras(poses, lenses, height, width)
+    path = navigation(scene.cameras, given.frames, range(given.views))
     total = started = time.process_time()
     with torch.no_grad():
         seen = see_views(scene, views, config)

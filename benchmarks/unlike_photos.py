@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sceneexpander.synthetic import World, auto_exposure, courtyard, encode_radiance, render_world
-from sceneexpander.synthetic.trajectories import MIN_CLEARANCE_M, pairwise_overlap, pose_from_angles
+from sceneexpander.synthetic.render import cameras_at
+from sceneexpander.synthetic.trajectories import MIN_CLEARANCE_M, pairwise_overlap, pose_from_angles, same_lens
 from sceneexpander.synthetic.views import make_scene
 
 Pixels = NDArray[np.uint8]
@@ -85,17 +86,17 @@ class Photo:
 def place_of(seed: str) -> Place:
     """The bundled courtyard ("courtyard") or the held-out procedural scene of that number."""
     if seed == "courtyard":
-        world, poses, focal = courtyard.courtyard_world(well=False), courtyard.captured_cameras()[1:6], 0.9
+        world, focal = courtyard.courtyard_world(well=False), 0.9
+        poses = courtyard.captured_cameras(HEIGHT, WIDTH)[1:6].world_from_cam.numpy()
     else:
-        world, cameras = make_scene(int(seed), views=VIEWS, height=HEIGHT, width=WIDTH, split="test")
-        if cameras.disconnected is not None:
+        world, chosen = make_scene(int(seed), views=VIEWS, height=HEIGHT, width=WIDTH, split="test")
+        if chosen.disconnected is not None:
             raise ValueError(f"seed {seed}: a view of this set shares nothing with the others")
-        poses, focal = cameras.world_from_cam, float(cameras.intrinsics_px[0, 0, 0]) / LONG
-    small = np.diag([0.25, 0.25, 1.0]) @ Shot(pose=(), focal_px=focal * LONG, height=HEIGHT, width=WIDTH).intrinsics
-    lenses = np.broadcast_to(small, (len(poses), 3, 3))
-    preview = render_world(world, poses, lenses, HEIGHT // 4, WIDTH // 4, supersample=1.0)
+        poses, focal = chosen.cameras.world_from_cam.numpy(), float(chosen.cameras.intrinsics_px[0, 0, 0]) / LONG
+    small = same_lens(poses, focal * LONG, HEIGHT, WIDTH).resized(HEIGHT // 4, WIDTH // 4)
+    preview = render_world(world, small, supersample=1.0)
     coarse = np.stack([cv2.resize(depth, (32, 24), interpolation=cv2.INTER_NEAREST) for depth in preview.depth])
-    overlap = pairwise_overlap(poses, small, coarse.astype(np.float64), HEIGHT // 4, WIDTH // 4)
+    overlap = pairwise_overlap(small, coarse.astype(np.float64))
     return Place(
         name=seed,
         world=world,
@@ -109,7 +110,7 @@ def _aimed(place: Place, focal_ratio: float) -> NDArray[np.float64]:
     """The cameras of a place for a longer lens: all look at what the last one looks at, and stand closer together."""
     last = place.world_from_cam[-1]
     lens = np.array([[WIDTH, 0, 4.0], [0, WIDTH, 3.0], [0, 0, 1.0]])
-    depth = float(np.median(render_world(place.world, last[None], lens[None], 6, 8, supersample=1.0).depth))
+    depth = float(np.median(render_world(place.world, cameras_at(last, lens, 6, 8), supersample=1.0).depth))
     target = last[:3, 3] + min(depth, 20.0) * last[:3, 2]
     share = min(1.0, place.focal_ratio / focal_ratio) ** 0.5
     poses = []
@@ -145,8 +146,8 @@ def take(place: Place, taken: Shot) -> Photo:
     if any(taken.distortion):
         picture = _through_bent_lens(place, taken)
     else:
-        lens = taken.intrinsics[None]
-        rendered = render_world(place.world, pose[None], lens, taken.height, taken.width, supersample=1.0)
+        camera = cameras_at(pose, taken.intrinsics, taken.height, taken.width)
+        rendered = render_world(place.world, camera, supersample=1.0)
         picture = encode_radiance(rendered.radiance[0], place.exposure)
     rng = np.random.default_rng(zlib.crc32(repr((place.name, taken)).encode()))
     noisy = picture + _NOISE * rng.standard_normal(picture.shape)
@@ -169,9 +170,8 @@ def _through_bent_lens(place: Place, taken: Shot) -> NDArray[Any]:
     straight = bent * (np.interp(wanted, bent_radius[rising], radius[rising]) / np.maximum(wanted, 1e-9))[:, None]
     reach = np.ceil(np.abs(straight).max(0) * taken.focal_px * finer).astype(int) + 2
     lens = np.array([[finer * taken.focal_px, 0, reach[0]], [0, finer * taken.focal_px, reach[1]], [0, 0, 1.0]])
-    pose = np.array(taken.pose)[None]
-    height, width = 2 * int(reach[1]), 2 * int(reach[0])
-    rendered = render_world(place.world, pose, lens[None], height, width, supersample=1.0)
+    camera = cameras_at(np.array(taken.pose), lens, 2 * int(reach[1]), 2 * int(reach[0]))
+    rendered = render_world(place.world, camera, supersample=1.0)
     wide = encode_radiance(rendered.radiance[0], place.exposure)
     maps = (straight * finer * taken.focal_px + reach - 0.5).reshape(taken.height, taken.width, 2).astype(np.float32)
     return np.asarray(cv2.remap(wide, maps, None, cv2.INTER_LINEAR))
@@ -319,8 +319,8 @@ def _with_exif(photos: list[Photo], focal_35mm: float) -> list[Photo]:
 @lru_cache(maxsize=4)
 def _elsewhere(number: int) -> Pixels:
     """A photo of another place."""
-    world, cameras = make_scene(9000 + number, views=2, height=HEIGHT, width=WIDTH, split="test")
-    rendered = render_world(world, cameras.world_from_cam[:1], cameras.intrinsics_px[:1], HEIGHT, WIDTH, supersample=1)
+    world, chosen = make_scene(9000 + number, views=2, height=HEIGHT, width=WIDTH, split="test")
+    rendered = render_world(world, chosen.cameras[:1], supersample=1)
     shown = encode_radiance(rendered.radiance[0], auto_exposure(rendered.radiance))
     return np.round(shown * 255).astype(np.uint8)
 

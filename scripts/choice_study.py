@@ -177,7 +177,7 @@ def edited_picture(folder: Path, edits: Sequence[str], config: ProjectConfig, lo
         found = assess(Candidate(data=data.getvalue(), name=name, provenance=source), state.views, "crop")
         if found.picture is None or found.fitted is None:
             raise UserError(found.provenance.refusal or "no picture", where=folder / recorded)
-        view = view_from_fitted(found.picture, found.fitted, view_id="inserted", generated=True, round_number=1)
+        view = view_from_fitted(found.picture.facts, found.fitted, view_id="inserted", generated=True, round_number=1)
         inserted = InsertedView(round=1, view=view, chosen=0, provenance=(found.provenance,))
         priors, _, _ = joint_reconstruction(state, inserted, loaded, config.frontend, seed=config.seed)
         inputs = RoundInputs(state=state, inserted=inserted, anchors=anchors, joint_priors=priors)

@@ -38,6 +38,7 @@ from sceneexpander.adaptation.sampling import Batch, sample_batch
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.store import read_json
 from sceneexpander.catalogue.methods import CORRECTED
+from sceneexpander.cli.plan import Question, request_of
 from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Reconstructor, as_module
 from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
 from sceneexpander.optimisation.config import DensityConfig, OptimiseConfig
@@ -45,7 +46,6 @@ from sceneexpander.optimisation.optimise import optimise
 from sceneexpander.pipeline.processes import end_with_parent
 from sceneexpander.pipeline.selection import Selection
 from sceneexpander.pipeline.workspace import make_workspace, workspace_environment
-from sceneexpander.plan import Question, request_of
 from sceneexpander.planning import Meter, PlanRequest, adaptation_cost, inference_cost
 from sceneexpander.planning.simulate import AllHeads
 from sceneexpander.splatting import RasterSettings, rasterise

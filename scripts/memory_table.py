@@ -9,9 +9,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from sceneexpander.cli.plan import Question, answer
 from sceneexpander.errors import entry_point
 from sceneexpander.files import write_bytes_atomic
-from sceneexpander.plan import Question, answer
 
 VIEWS = (2, 3, 5, 9, 17, 25, 32)
 OPTIONS = ("gpu24", "paper")

@@ -7,8 +7,8 @@ import shutil
 from dataclasses import asdict, dataclass
 
 from sceneexpander.adaptation.config import AdaptConfig
-from sceneexpander.adaptation.loop import StepRecord
 from sceneexpander.adaptation.observe import Look, warnings_of
+from sceneexpander.adaptation.records import StepRecord
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.inserted import InsertedView
 from sceneexpander.artifacts.live import LiveLog

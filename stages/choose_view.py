@@ -9,7 +9,8 @@ from sceneexpander.artifacts.views import save_png
 from sceneexpander.config.files import read_sections
 from sceneexpander.files import directory_being_written
 from sceneexpander.generation import ChoiceConfig, choose_view
-from sceneexpander.judge import JudgeConfig, make_judge
+from sceneexpander.judge.ask import make_judge
+from sceneexpander.judge.config import JudgeConfig
 from sceneexpander.pipeline.project import JUDGED_FOLDER
 from stages import layout
 from stages.machine import use_machine

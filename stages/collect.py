@@ -29,6 +29,7 @@ def _round(scene: str, number: int, methods: Sequence[str], *, last: bool) -> Ro
                 renders=layout.renders(scene, number, method),
                 splats=layout.packed(scene, number, method),
                 metrics=layout.metrics(scene, number, method),
+                held_out=layout.held_out_seen(scene, number, method),
                 report=layout.reconstruction(scene, number, method).parent / "report.json",
                 refinement=layout.reconstruction(scene, number, method).parent / layout.REFINEMENT,
             )
@@ -73,6 +74,7 @@ def main(cell: Cell) -> None:
         settings=flatten(config),
         overrides=read_overrides(Path("params.yaml")),
         cameras=layout.cameras(layout.state(cell.scene, 0)),
+        held_out=layout.held_out(cell.scene),
     )
     with directory_being_written(layout.PAGES / cell.scene) as folder:
         collect_scene(source, folder)

@@ -2,40 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from sceneexpander.adaptation.config import AdaptConfig
-from sceneexpander.artifacts.anchors import Anchors
-from sceneexpander.artifacts.inserted import InsertedView
-from sceneexpander.artifacts.state import ExpansionState, load_priors
-from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.files import read_sections
-from sceneexpander.expansion import (
-    CorrectionsConfig,
-    MethodConfig,
-    ModelConfig,
-    RoundInputs,
-    compose_procedure,
-    load_model,
-)
 from sceneexpander.files import directory_being_written
-from sceneexpander.photometric.config import RefineConfig
 from stages import layout
-from stages.machine import use_machine
 from stages.runner import Cell, left_out, stage
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sections:
-    """What this stage reads of the configuration."""
-
-    seed: int
-    device: str
-    threads: int
-    model: ModelConfig
-    adapt: AdaptConfig
-    corrections: CorrectionsConfig
-    refine: RefineConfig
 
 
 @stage("scene", "round", "previous", "method")
@@ -43,6 +13,15 @@ def main(cell: Cell) -> None:
     """The procedure of `adapt` without its steps."""
     if left_out(cell):
         return
+    # Only now: who does not ask for it need not wait for torch.
+    from sceneexpander.artifacts.anchors import Anchors
+    from sceneexpander.artifacts.inserted import InsertedView
+    from sceneexpander.artifacts.state import ExpansionState, load_priors
+    from sceneexpander.artifacts.store import write_json_atomic
+    from sceneexpander.expansion import MethodConfig, RoundInputs, compose_procedure, load_model
+    from stages.adapt import Sections
+    from stages.machine import use_machine
+
     sections = read_sections(layout.config(cell.scene), Sections)
     use_machine(sections.threads)
     inputs = RoundInputs(

@@ -19,7 +19,7 @@ from stages import layout
 from stages.runner import Cell, project_root, stage
 
 if TYPE_CHECKING:
-    from sceneexpander.judge import Work
+    from sceneexpander.judge.rounds import Work
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +36,8 @@ def work_of(scene: str, number: int, methods: Sequence[str], config: ChatJudgeCo
     # Only now: torch takes seconds to import.
     from sceneexpander.artifacts.inserted import InsertedView
     from sceneexpander.artifacts.views import to_uint8
-    from sceneexpander.judge import Work, shown_of
+    from sceneexpander.judge.frames import shown_of
+    from sceneexpander.judge.rounds import Work
     from sceneexpander.services.pictures import encode_picture
 
     target = to_uint8(InsertedView.load(layout.inserted(scene, number)).view.photo(0))
@@ -64,7 +65,8 @@ def main(cell: Cell) -> None:
             JudgedRound(scene=cell.scene, round=cell.round).save(folder, {})
             _log.info("no judge configured")
             return
-        from sceneexpander.judge import judge_round, make_judge
+        from sceneexpander.judge.ask import make_judge
+        from sceneexpander.judge.rounds import judge_round
 
         judge = make_judge(config, project_root() / JUDGED_FOLDER)
         assert judge is not None  # noqa: S101 - by the type of its settings

@@ -161,6 +161,11 @@ def metrics(scene: str, number: int, method: str) -> Path:
     return round_folder(scene, number) / "metrics" / f"{method}.json"
 
 
+def held_out_seen(scene: str, number: int, method: str) -> Path:
+    """What a method's scene shows of held-out photos, a `HeldOutSeen`."""
+    return round_folder(scene, number) / "held_out" / method
+
+
 def judged(scene: str, number: int) -> Path:
     """The `JudgedRound` of a round."""
     return round_folder(scene, number) / "judged"

@@ -12,7 +12,6 @@ from sceneexpander.config.files import read_sections
 from sceneexpander.errors import UserError
 from sceneexpander.files import directory_being_written
 from sceneexpander.optimisation.config import OptimiseConfig
-from sceneexpander.pipeline.progress import progress_bar
 from stages import layout
 from stages.runner import Cell, checkpoint_folder, left_out, remove_checkpoints, run_identity, stage
 
@@ -34,6 +33,7 @@ def optimise_start(cell: Cell, *, stage_name: str) -> None:
     from sceneexpander.artifacts.reconstruction import Reconstruction
     from sceneexpander.artifacts.views import ViewSet
     from sceneexpander.optimisation.optimise import optimise, unusable
+    from sceneexpander.pipeline.progress import progress_bar
     from stages.machine import use_machine
 
     sections = read_sections(layout.config(cell.scene), Sections)

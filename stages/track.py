@@ -17,7 +17,7 @@ from sceneexpander.pipeline.project import SWEEP_ENV
 from sceneexpander.pipeline.recording import RECORDED, Recorded, RecordedScene
 from sceneexpander.pipeline.selection import read_selection
 from sceneexpander.tracking import RunRecord, TrackingConfig, record_runs, scene_runs
-from sceneexpander.tracking.server import shown, where_runs_go
+from sceneexpander.tracking.server import hide_credentials, where_runs_go
 from stages import layout
 from stages.runner import Cell, project_root, stage
 
@@ -66,7 +66,7 @@ def main(_: Cell) -> None:
         )
         store = _record(records, sections.tracking, root)
         recorded[scene] = RecordedScene(
-            configured=shown(sections.tracking.uri),
+            configured=hide_credentials(sections.tracking.uri),
             store=store or "",
             runs=tuple(record.key for record in records) if store else None,
         )
@@ -83,7 +83,7 @@ def _record(records: Sequence[RunRecord], config: TrackingConfig, root: Path) ->
         line = known.line() if isinstance(known, UserError) else str(known).strip().partition("\n")[0]
         _log.warning("not recorded in MLflow (%s); the same command tries again", line or type(error).__name__)
         return None
-    return shown(config.uri)
+    return hide_credentials(config.uri)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,10 @@
 __version__ = "0.1.0"
 
 import sys
+from pathlib import Path
+
+# A command can be run by its own name as well: `python -m sceneexpander.expand` is found in cli/. Imports name the room.
+__path__.append(str(Path(__file__).with_name("cli")))
 
 if sys.argv[:1] == ["-m"]:  # the interpreter is looking for the program of `python -m sceneexpander...`
     from sceneexpander.errors import quiet_start

@@ -6,6 +6,7 @@ What is written stands under a scratch name beside its target, is synced, and th
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import os
 import shutil
@@ -13,18 +14,44 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
+from sceneexpander.errors import UserError
+
+_NOT_WRITABLE = {
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.ELOOP, errno.ENAMETOOLONG,
+}  # fmt: skip
+
 
 @contextlib.contextmanager
 def complete_file(path: Path) -> Iterator[Path]:
-    """A scratch path beside ``path`` (ending in ``.part``); synced and renamed to ``path`` on success, removed otherwise."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """A scratch path beside ``path`` (ending in ``.part``); synced and renamed to ``path`` on success, removed otherwise.
+
+    Raises:
+        UserError: there is a folder of that name, or nothing can be written there.
+    """
+    if path.is_dir():
+        raise UserError("is a folder, expected a file", where=path, fix="move it away, or choose another place")
     scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+    with _writable(path.parent, scratch):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield scratch
+            _sync(scratch)
+            scratch.replace(path)
+        finally:
+            scratch.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _writable(folder: Path, scratch: Path) -> Iterator[None]:
+    """A `UserError` in place of what the system says of a folder that cannot be made or written to; a full disk stays what it is."""
     try:
-        yield scratch
-        _sync(scratch)
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        name = Path(os.fsdecode(error.filename)) if isinstance(error.filename, (str, bytes)) else None
+        if error.errno not in _NOT_WRITABLE or name not in (scratch, folder, *folder.parents):
+            raise
+        problem = f"cannot be written to ({os.strerror(error.errno)})"
+        raise UserError(problem, where=folder, fix="choose another place, or mend its rights") from None
 
 
 def write_bytes_atomic(path: Path, data: bytes) -> None:
@@ -38,11 +65,17 @@ def directory_being_written(target: Path) -> Iterator[Path]:
     """Yield a scratch directory that becomes ``target`` (replacing it) only if the block ends without an error.
 
     What a killed writer of the same target left is cleared first: a target has one writer at a time.
+
+    Raises:
+        UserError: there is a file of that name, or nothing can be written there.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    recover_directory(target)
+    if target.exists() and not target.is_dir():
+        raise UserError("is a file, expected a folder", where=target, fix="move it away, or choose another place")
     scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
-    scratch.mkdir()
+    with _writable(target.parent, scratch):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        recover_directory(target)
+        scratch.mkdir()
     try:
         yield scratch
         for path in sorted(scratch.rglob("*")):

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.pipeline
 CHOICE = "choose_view@room-round0"
 KEY = "sk-verysecret0123456789"
 SWEEP = (
-    "from pathlib import Path; from sceneexpander.sweep import check_axes, check_inputs; "
+    "from pathlib import Path; from sceneexpander.cli.sweep import check_axes, check_inputs; "
     "check_inputs(check_axes(['--multirun', 'seed=0,1'], Path()).jobs, Path())"
 )
 

@@ -204,7 +204,7 @@ def test_the_live_viewer_shows_what_we_render(tab: Page, tmp_path: Path) -> None
     try:
         tab.requested.clear()
         tab.open(f"http://{HOST}:{viewer.port}/", WIDTH, HEIGHT)
-        client = viewer.wait_for_client(120)
+        client = viewer.wait_for_client(300)
         viewer.show_cameras(False)
         camera = viser_camera(viewer.cameras("sceneexpander"), 1)
         # The browser draws when it gets to it: ask until the Gaussians have arrived.
@@ -217,7 +217,7 @@ def test_the_live_viewer_shows_what_we_render(tab: Page, tmp_path: Path) -> None
                 position=camera.position,
                 fov=camera.fov,
                 transport_format="png",
-                timeout=120,
+                timeout=300,
             )
             shot = torch.from_numpy(drawn[..., :3].copy()).permute(2, 0, 1).float() / 255
             best = psnr(shot, wanted)

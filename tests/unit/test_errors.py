@@ -86,7 +86,7 @@ def test_an_interrupt_while_libraries_are_imported_is_one_line_too(tmp_path: Pat
     # Stands for torch, which takes seconds.
     (tmp_path / "yaml.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(30)\n")
     process = subprocess.Popen(
-        [sys.executable, "-m", "sceneexpander.expand", "x"],
+        [sys.executable, "-m", "sceneexpander.cli.expand", "x"],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT / "src")])},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -7,6 +7,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -39,6 +40,7 @@ def names(requirements: list[str]) -> set[str]:
     return {re.split(r"[\s<>=!~;\[]", item, maxsplit=1)[0].lower() for item in requirements}
 
 
+@cache
 def imported(*folders: str) -> set[str]:
     """First parts of everything that files import, at their top or later."""
     found = set()

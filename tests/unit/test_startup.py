@@ -12,7 +12,18 @@ import pytest
 from sceneexpander.pipeline.fingerprint import SourceTree
 
 ROOT = Path(__file__).parents[2]
-LIGHT = ("fingerprint", "rival", "optimise", "gaussian_splatting", "render", "pack", "evaluate", "track")
+LIGHT = (
+    "fingerprint",
+    "correct",
+    "rival",
+    "optimise",
+    "gaussian_splatting",
+    "render",
+    "pack",
+    "evaluate",
+    "judge",
+    "track",
+)
 
 
 @pytest.mark.parametrize("stage", LIGHT)

@@ -103,6 +103,22 @@ def reality_capture(folder: Path) -> None:
         (folder / f"{k}.xmp").write_text(f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{rdf}</x:xmpmeta>')
 
 
+def heading_pitch_roll(rotation: np.ndarray) -> tuple[float, float, float]:
+    """Angles in degrees of a camera-from-world rotation, by the third column and second row of the vendor's matrix."""
+    heading = np.arctan2(-rotation[1, 0], -rotation[1, 1])
+    roll = np.arctan2(-rotation[0, 2], -rotation[2, 2])
+    return float(np.degrees(heading)), float(np.degrees(np.arcsin(-rotation[1, 2]))), float(np.degrees(roll))
+
+
+def reality_capture_csv(folder: Path, lens: str = "30,-0.01,0.005,0.1,-0.02,0.003,0,0,0") -> None:
+    pictures(folder, ["0.png", "1.png", "2.png"])
+    rows = ["#cameras 4", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for k in (*range(3), 7):
+        numbers = [*pose(k)[:3, 3].tolist(), *heading_pitch_roll(pose(k)[:3, :3].T)]
+        rows.append(",".join([f"{k}.png", *(f"{value:.16g}" for value in numbers), lens]))
+    (folder / "cameras.csv").write_text("\n".join(rows) + "\n")
+
+
 def metashape(folder: Path, world: str = "") -> None:
     pictures(folder, ["0.png", "1.png", "2.png"])
     cameras = "".join(
@@ -171,4 +187,5 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "seven_scenes": seven_scenes,
     "metashape": metashape,
     "reality_capture": reality_capture,
+    "reality_capture_csv": reality_capture_csv,
 }

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from sceneexpander import expand as command
-from sceneexpander.expand import Request
+from sceneexpander.cli import expand as command
+from sceneexpander.cli.expand import Request
 from sceneexpander.pipeline.preflight import CheckedScene
 
 ROOT = Path(__file__).parents[2]

@@ -12,7 +12,10 @@ import numpy as np
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
-from sceneexpander.judge import ChatJudgeConfig, Judge, Shown, Work, make_judge
+from sceneexpander.judge.ask import Judge, make_judge
+from sceneexpander.judge.config import ChatJudgeConfig
+from sceneexpander.judge.frames import Shown
+from sceneexpander.judge.rounds import Work
 from sceneexpander.services.pictures import SentPicture, encode_picture
 from tests.support.loopback import Answer, Service, said
 

@@ -20,6 +20,7 @@ from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.losses import ViewGeometry
 from sceneexpander.adaptation.objective import NonFiniteLoss
 from sceneexpander.adaptation.observe import Look, Observer, warnings_of
+from sceneexpander.adaptation.records import StepRecord
 from sceneexpander.adaptation.sampling import Batch, sample_batch
 from sceneexpander.adaptation.trainable import plain_state, trained_parts
 from sceneexpander.geometry.gauge import in_gauge_of
@@ -28,26 +29,6 @@ from sceneexpander.models.protocol import Reconstructor, as_module
 _log = logging.getLogger(__name__)
 
 __all__ = ["AdaptationInputs", "AdaptationResult", "NonFiniteLoss", "StepRecord", "adapt", "run_key"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StepRecord:
-    """What one step did. Loss terms are weighted as they enter the objective (before lambda)."""
-
-    step: int
-    captured: int
-    inserted: bool
-    loss: float
-    anchor_camera: float
-    anchor_depth: float
-    anchor_normal: float
-    gen_camera: float
-    gen_depth: float
-    gen_normal: float
-    drift: float  # L_reg before lambda_reg
-    gradient_norm: float
-    restored: int
-    anchor_gaussian: float = 0.0  # beyond the paper, see `AdaptConfig.alpha_gaussian`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,7 +150,7 @@ class Run:
         for step in range(len(log.records), config.steps + 1):
             if step > len(log.records):
                 log.add(self.step(step))
-            stop = plateau.reached(log.records, config)
+            stop = plateau.has_plateaued(log.records, config)
             if (_look_due(step, config) or (stop and config.observe_every)) and step not in log.looked_at:
                 log.add(observer.look(step))
             if stop and step < config.steps:

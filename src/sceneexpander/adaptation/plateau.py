@@ -7,15 +7,12 @@ view, and of the self-distillation loss over the steps that see the inserted vie
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from sceneexpander.adaptation.config import AdaptConfig
-
-if TYPE_CHECKING:
-    from sceneexpander.adaptation.loop import StepRecord
+from sceneexpander.adaptation.records import StepRecord
 
 
-def reached(records: Sequence[StepRecord], config: AdaptConfig) -> bool:
+def has_plateaued(records: Sequence[StepRecord], config: AdaptConfig) -> bool:
     """Whether the last window of steps is not better than the one before by the configured share. Asked once per window."""
     window = config.plateau.window
     if window == 0 or len(records) < 2 * window or len(records) % window:

@@ -118,6 +118,7 @@ class MethodPage:
         videos: by layer.
         stills: some frames.
         view_pictures: every view at its own camera, by view.
+        held_out_pictures: what the scene shows at the cameras found for held-out photos, by view.
         frames: of each video.
         fps: frames per second.
         inserted_frame: at which the tour stands at the inserted camera.
@@ -147,6 +148,7 @@ class MethodPage:
     gaussians: int
     metrics: str
     map: str
+    held_out_pictures: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -274,6 +276,7 @@ class ScenePage:
         overrides: Hydra overrides as they were given.
         model: of the first reconstruction.
         captured: the photos.
+        held_out: photos that nothing was made from.
         cameras: of the photos alone; None for models that need none.
         statistics: of the stages that are in no round.
         rounds: in order.
@@ -287,6 +290,7 @@ class ScenePage:
     cameras: CameraReport | None
     statistics: Mapping[str, StageRun]
     rounds: tuple[RoundPage, ...]
+    held_out: tuple[Photo, ...] = ()
 
     def save(self, folder: Path) -> None:
         """Write beside what it names."""
@@ -306,7 +310,7 @@ class ScenePage:
 
     def places(self) -> Iterator[str]:
         """Every file that it names."""
-        yield from (photo.picture for photo in self.captured)
+        yield from (photo.picture for photo in (*self.captured, *self.held_out))
         for item in self.rounds:
             yield from (item.inserted, item.viewer)
             yield from (place for place in (item.sheet, item.overlay, item.problems) if place is not None)
@@ -317,7 +321,7 @@ class ScenePage:
             yield from (place for look in (item.looks.looks if item.looks else ()) for place in look.pictures.values())
             for method in item.methods:
                 yield method.metrics
-                yield from (*method.videos.values(), *method.view_pictures.values())
+                yield from (*method.videos.values(), *method.view_pictures.values(), *method.held_out_pictures.values())
                 yield from (place for still in method.stills for place in still.pictures.values())
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 FACTS_NAME = "artifact.json"
 TENSORS_NAME = "tensors.safetensors"
 MAX_NAME_BYTES = 1024  # of a file inside an artefact, with its folders
+MAX_PART_BYTES = 255  # of each of these: file systems know no longer ones
 RERUN = "rerun the stage that makes it"
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -121,7 +122,8 @@ def save_artifact(folder: Path, schema: str, facts: Mapping[str, object], tensor
 def check_inside(name: str, folder: Path) -> None:
     """Raise `ArtifactError` if a file name that an artefact holds leads out of its folder, or can be none."""
     parts = Path(name).parts
-    if not parts or Path(name).is_absolute() or ".." in parts or "\0" in name or len(name.encode()) > MAX_NAME_BYTES:
+    long = len(name.encode()) > MAX_NAME_BYTES or any(len(part.encode()) > MAX_PART_BYTES for part in parts)
+    if not parts or Path(name).is_absolute() or ".." in parts or "\0" in name or long:
         raise ArtifactError(f"names a file {shorten(name)!a}, which is not inside it", where=folder, fix=RERUN)
 
 

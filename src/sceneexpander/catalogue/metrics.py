@@ -171,7 +171,7 @@ class Metric:
 def _at_size(
     scope: Scope, group: Group, where: str, title: str, meanings: tuple[str, str, str, str], shown: str = ""
 ) -> tuple[Metric, ...]:
-    """PSNR, SSIM, ST-LPIPS and the open share at a size; their names go into ``title``.
+    """PSNR, SSIM, the open share and, at the pictures' own size, ST-LPIPS; their names go into ``title``.
 
     Those with a meaning are on the page; ``shown`` is the one that is in the tables only.
     """
@@ -191,10 +191,11 @@ def _at_size(
         )
 
     psnr, ssim, st_lpips, opened = meanings
+    perceptual = metric("st_lpips", f"st_lpips_{where}", "ST-LPIPS", st_lpips, 4, "", "lower")
     return (
         metric("psnr", f"psnr_{where}_db", "PSNR", psnr, 2, "dB", "higher"),
         metric("ssim", f"ssim_{where}", "SSIM", ssim, 3, "", "higher"),
-        metric("st_lpips", f"st_lpips_{where}", "ST-LPIPS", st_lpips, 4, "", "lower"),
+        *((perceptual,) if scope.size is Size.OWN else ()),
         metric("open", f"seen_through_{where}", "Open", opened, 1, "%", "lower"),
     )
 
@@ -744,8 +745,8 @@ COUNTS = (
 )
 
 
-def _looked(kind: str, title: str, digits: int) -> tuple[Metric, ...]:
-    """LPIPS or FLIP of each kind of views."""
+def _looked(kind: str, title: str, digits: int, *, unit: str = "", better: Better = "lower") -> tuple[Metric, ...]:
+    """LPIPS, FLIP or CVVDP of each kind of views."""
     places = (
         ("captured", Group.QUALITY, _CAPTURED, "stored size", Shown.TABLE),
         ("held_out", Group.QUALITY, _HELD_OUT, "held-out photos", Shown.TABLE),
@@ -757,15 +758,20 @@ def _looked(kind: str, title: str, digits: int) -> tuple[Metric, ...]:
             group=group,
             title=f"{title}, {where}",
             scope=scope,
+            unit=unit,
             digits=digits,
-            better="lower",
+            better=better,
             shown=shown,
         )
         for name, group, scope, where, shown in places
     )
 
 
-LOOKED = (*_looked("lpips", "LPIPS", 3), *_looked("flip", "FLIP", 3))
+LOOKED = (
+    *_looked("lpips", "LPIPS", 3),
+    *_looked("flip", "FLIP", 3),
+    *_looked("cvvdp", "CVVDP", 2, unit="JOD", better="higher"),
+)
 
 # Where the new region is known.
 REGIONS = tuple(

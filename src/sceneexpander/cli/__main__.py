@@ -1,4 +1,4 @@
-"""``python -m sceneexpander.cli``: the same as ``sceneexpander``, where the script is not installed."""
+"""``python -m sceneexpander.cli``: the same as ``python -m sceneexpander``."""
 
 from sceneexpander.cli.main import main
 

@@ -21,25 +21,27 @@ class Command:
 
 
 COMMANDS = (
-    Command("expand", "sceneexpander.expand", "expand the scene of a folder of photos by a picture and a sentence"),
+    Command("expand", "sceneexpander.cli.expand", "expand the scene of a folder of photos by a picture and a sentence"),
     Command("run", "sceneexpander.pipeline.plain", "bring the project's pipeline up to date without DVC"),
-    Command("sweep", "sceneexpander.sweep", "run the pipeline for many combinations of settings"),
-    Command("ablation", "sceneexpander.ablation", "measure what each part of the method does, against known truth"),
+    Command("sweep", "sceneexpander.cli.sweep", "run the pipeline for many combinations of settings"),
+    Command("ablation", "sceneexpander.cli.ablation", "measure what each part of the method does, against known truth"),
     Command(
         "expandbench",
-        "sceneexpander.benchmark",
+        "sceneexpander.cli.benchmark",
         "score expansions of any program on worlds whose truth is known exactly",
     ),
-    Command("plan", "sceneexpander.plan", "tell memory and operations in advance, without a GPU or weights"),
-    Command("judge", "sceneexpander.judge_run", "have a vision-language model judge finished scenes"),
-    Command("table", "sceneexpander.tables", "fill the paper's two tables with what was measured here"),
+    Command("plan", "sceneexpander.cli.plan", "tell memory and operations in advance, without a GPU or weights"),
+    Command("judge", "sceneexpander.cli.judge_run", "have a vision-language model judge finished scenes"),
+    Command("table", "sceneexpander.cli.tables", "fill the paper's two tables with what was measured here"),
     Command("view", "sceneexpander.viewer.__main__", "walk through a reconstructed scene in the browser"),
     Command(
         "study", "sceneexpander.study.__main__", "let people rank videos of methods blindly, and compute what they said"
     ),
-    Command("export", "sceneexpander.export", "write a finished scene as PLY, SPZ, GLB, mesh, COLMAP, nerfstudio, ..."),
-    Command("ui", "sceneexpander.ui", "open all recorded runs in the browser, running ones live"),
-    Command("follow", "sceneexpander.follow", "mirror running adaptations into MLflow without the browser"),
+    Command(
+        "export", "sceneexpander.cli.export", "write a finished scene as PLY, SPZ, GLB, mesh, COLMAP, nerfstudio, ..."
+    ),
+    Command("ui", "sceneexpander.cli.ui", "open all recorded runs in the browser, running ones live"),
+    Command("follow", "sceneexpander.cli.follow", "mirror running adaptations into MLflow without the browser"),
     Command(
         "conformance",
         "sceneexpander.conformance.__main__",
@@ -47,7 +49,7 @@ COMMANDS = (
     ),
     Command(
         "convert",
-        "sceneexpander.convert_checkpoint",
+        "sceneexpander.cli.convert_checkpoint",
         "convert a PyTorch checkpoint to safetensors, running no code",
     ),
     Command("check", "sceneexpander.cli.check", "look at params.yaml, conf/, photos and weights; run nothing"),

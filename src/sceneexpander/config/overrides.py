@@ -42,10 +42,10 @@ _SECRETS = "oc.env"  # OmegaConf's way to the environment
 
 def override(key: str, text: str) -> str:
     """The override that sets ``key`` to exactly ``text``, whatever letters are in it."""
-    return f"{key}={quoted(text)}"
+    return f"{key}={quote(text)}"
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     """``text`` as a value in Hydra's grammar."""
     from hydra.core.override_parser.types import Quote, QuotedString
 
@@ -110,20 +110,20 @@ def _written_out(item: str, *, absolute: bool, sweep: bool, folder: Path) -> str
     if len(item) > MAX_OVERRIDE:
         return item  # is refused when it is composed
     if name in PATH_KEYS and _names_a_file(raw, folder, where=name):
-        return f"{key}={quoted(_absolute(raw, folder, name) if absolute else raw)}"
+        return f"{key}={quote(_absolute(raw, folder, name) if absolute else raw)}"
     try:
         parsed = OverridesParser.create().parse_override(item)
         value = parsed.value()
     # Beside its own errors, the parser lets those of very long numbers and deep lists through.
     except (HydraException, ValueError, TypeError, LookupError, RecursionError):
-        return f"{key}={quoted(raw)}"
+        return f"{key}={quote(raw)}"
     if parsed.value_type != ValueType.ELEMENT or isinstance(value, (list, dict)):
-        return item if sweep else f"{key}={quoted(raw)}"
+        return item if sweep else f"{key}={quote(raw)}"
     # Written as Hydra wants it, e.g. in quotes.
     text = _plain(value) if isinstance(value, str) and name in PATH_KEYS and absolute else None
     if text is None or not _names_a_file(text, folder, where=name):
         return item
-    return f"{key}={quoted(_absolute(text, folder, name))}"
+    return f"{key}={quote(_absolute(text, folder, name))}"
 
 
 def _plain(value: str) -> str | None:
@@ -135,20 +135,20 @@ def _plain(value: str) -> str | None:
 
 
 def _absolute(text: str, folder: Path, name: str) -> str:
-    return str(folder / expanded(text, where=name))
+    return str(folder / expand_home(text, where=name))
 
 
 def _names_a_file(text: str, folder: Path, *, where: str) -> bool:
     try:
         return any(
-            (folder / expanded(name, where=where)).is_file()
+            (folder / expand_home(name, where=where)).is_file()
             for name in dict.fromkeys((text, text.replace(ROUND_FIELD, "1")))
         )
     except (OSError, ValueError):  # too long, or characters that no file has
         return False
 
 
-def expanded(text: str, *, where: str) -> Path:
+def expand_home(text: str, *, where: str) -> Path:
     """A path with ``~`` and ``~user`` written out. Raises `ConfigError` if there is no such home folder, nor a file of that name."""
     path = os.path.expanduser(text)
     if path.startswith("~") and not os.path.lexists(path):

@@ -20,6 +20,7 @@ class EvaluateConfig:
         consistency_frames: frames of the camera path on which registration, cameras, TSED and steadiness are measured; 0: not at all.
         hold_out: photos that are left out of everything and measured on; ``auto``: one of five or more.
         flip: also FLIP, where the package ``flip-evaluator`` is installed.
+        cvvdp: also ColorVideoVDP, where the package ``cvvdp`` is installed.
         lpips_weights: file with the official weights of AlexNet; None: LPIPS is not measured. Never downloaded.
         st_lpips: also the perceptual distance, where the package ``stlpips-pytorch`` is installed.
     """
@@ -30,6 +31,7 @@ class EvaluateConfig:
     consistency_frames: Annotated[int, Range(0, 64)] = 0
     hold_out: Annotated[int, Range(0, 1000)] | Literal["auto"] = "auto"
     flip: bool = True
+    cvvdp: bool = False
     lpips_weights: str | None = None
     st_lpips: bool = True
 

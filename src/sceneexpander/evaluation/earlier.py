@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.image import psnr
-from sceneexpander.evaluation.measure import Measure, Subject, Values
+from sceneexpander.evaluation.measure import Measure, Subject, Values, shows_enough
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 
 
@@ -24,7 +24,7 @@ class EarlierRegions(Measure):
         inserted: list[float] = []
         for view in subject.seen:
             later = round_of[made.view_ids[view.index]] >= subject.round_number
-            if not bool(made.posed[view.index]) or (view.generated and later):
+            if not bool(made.posed[view.index]) or (view.generated and later) or not shows_enough(view):
                 continue
             value = min(psnr(view.render.rgb[0], view.picture, view.valid), PSNR_CAP_DB)
             (inserted if view.generated else captured).append(value)

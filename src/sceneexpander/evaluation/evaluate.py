@@ -16,7 +16,7 @@ from sceneexpander.catalogue import register
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.earlier import EarlierRegions
-from sceneexpander.evaluation.held_out import Unseen, measure_held_out
+from sceneexpander.evaluation.held_out import Show, Unseen, measure_held_out
 from sceneexpander.evaluation.measure import Measure, Subject, Values, known_values
 from sceneexpander.evaluation.sizes import AtOtherSizes
 from sceneexpander.evaluation.tour import TourConsistency
@@ -92,6 +92,7 @@ def evaluate(
     truth: SceneTruth | None = None,
     held_out: HeldOut = NOTHING_HELD_OUT,
     fit: Fit = Fit.PREDICTED,
+    show_held_out: Show | None = None,
 ) -> MetricsRow:
     """Measure a reconstruction.
 
@@ -106,11 +107,12 @@ def evaluate(
         truth: known truth, if any.
         held_out: photos that the reconstruction was not made from, matched with the captured ones.
         fit: what was done to its Gaussians after they were predicted.
+        show_held_out: is given what is seen at the cameras of held-out photos.
     """
     seen = see_views(reconstruction, views, config)
     captured = measure_views(seen, MEASURES, generated=False)
     inserted = measure_views(seen, MEASURES, generated=True)
-    unseen = measure_held_out(reconstruction, held_out, seen, config, MEASURES)
+    unseen = measure_held_out(reconstruction, held_out, seen, config, MEASURES, show_held_out)
     if not captured:
         raise ValueError("the reconstruction has no captured view")
     in_this_round = {record.view_id for record in views.records if record.round == round_number}

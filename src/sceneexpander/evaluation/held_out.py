@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -28,7 +28,15 @@ from sceneexpander.catalogue import Views, metric_named
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.image import psnr, ssim
-from sceneexpander.evaluation.measure import Measure, SeenView, UnseenView, Values, known_values
+from sceneexpander.evaluation.measure import (
+    FEWEST_PIXELS,
+    Measure,
+    SeenView,
+    UnseenView,
+    Values,
+    known_values,
+    shows_enough,
+)
 from sceneexpander.evaluation.perceptual import st_lpips
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.frontend.resection import Sighting, resect, solve_pose
@@ -39,13 +47,13 @@ from sceneexpander.geometry.rigid import rotation_angle_deg, transform_points
 from sceneexpander.geometry.similarity import align_poses
 from sceneexpander.splatting import render
 
+Show = Callable[[str, Float[Tensor, "3 height width"]], None]
 _log = logging.getLogger(__name__)
 _THRESHOLDS = SfmConfig()  # those of a view that joins a scene
 _KEPT_DEG, _KEPT_SHARE = 0.1, 1e-3  # given cameras were kept if all are as near as this; the second over their extent
 _FOCAL_FACTORS = tuple(
     math.log(factor) for factor in (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0)
 )  # tried where no lens is known
-_FEWEST_PIXELS = 64
 
 
 @torch.no_grad()
@@ -55,6 +63,7 @@ def measure_held_out(
     seen: Sequence[SeenView],
     config: EvaluateConfig,
     measures: Sequence[Measure],
+    show: Show | None = None,
 ) -> tuple[ViewMetrics, ...]:
     """One row per held-out photo; without a camera its values are empty.
 
@@ -64,6 +73,7 @@ def measure_held_out(
         seen: the reconstruction's views, drawn at their own cameras.
         config: settings.
         measures: asked about every photo that has a camera.
+        show: is given the id of every photo that has a camera and what is seen from there.
 
     Raises:
         ValueError: the photos are of another size than the reconstruction, or a measure answers with numbers of other views.
@@ -83,6 +93,8 @@ def measure_held_out(
             _log.warning("%s: the held-out photo has no camera in the scene of %s", record.name, reconstruction.method)
         else:
             drawn = render(reconstruction.gaussians, camera)
+            if show is not None:
+                show(record.view_id, drawn.rgb[0])
             view = UnseenView(
                 picture=views.images[number],
                 photo=views.photo(number),
@@ -90,8 +102,11 @@ def measure_held_out(
                 render=drawn,
                 config=config,
             )
-            for measure in measures:
-                values |= known_values(measure, measure.of_held_out(view))
+            if not shows_enough(view):
+                _log.warning("%s: too little of the held-out photo shows the place: no numbers", record.name)
+            else:
+                for measure in measures:
+                    values |= known_values(measure, measure.of_held_out(view))
             for name in values:
                 if metric_named(name).scope.views is not Views.HELD_OUT:
                     raise ValueError(f"{name!r} is not a metric of held-out photos")
@@ -225,9 +240,9 @@ class Unseen(Measure):
     def of_held_out(self, view: UnseenView) -> Values:
         """What the scene does not cover is black in the first three."""
         rgb, alpha = view.render.rgb[0], view.render.alpha[0]
-        counted: Bool[Tensor, "height width"] = torch.ones_like(alpha, dtype=torch.bool)
-        if view.valid is not None and int(view.valid.sum()) >= _FEWEST_PIXELS:
-            counted = view.valid
+        counted: Bool[Tensor, "height width"] = (
+            torch.ones_like(alpha, dtype=torch.bool) if view.valid is None else view.valid
+        )
         covered = (alpha > view.config.coverage_alpha) & counted
         return {
             "psnr_held_out_db": min(psnr(rgb, view.picture, counted), PSNR_CAP_DB),
@@ -235,6 +250,6 @@ class Unseen(Measure):
             "st_lpips_held_out": st_lpips(rgb * counted, view.picture * counted) if view.config.st_lpips else None,
             "held_out_covered": float(covered[counted].double().mean()),
             "psnr_held_out_covered_db": (
-                min(psnr(rgb, view.picture, covered), PSNR_CAP_DB) if int(covered.sum()) >= _FEWEST_PIXELS else None
+                min(psnr(rgb, view.picture, covered), PSNR_CAP_DB) if int(covered.sum()) >= FEWEST_PIXELS else None
             ),
         }

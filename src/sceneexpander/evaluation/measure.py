@@ -22,6 +22,7 @@ from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import Render
 
+FEWEST_PIXELS = 64  # fewer say nothing about a picture or a region
 Values = Mapping[str, float | None]  # by names of the catalogue; None: not defined here
 
 
@@ -109,6 +110,11 @@ class Measure(Protocol):
     def of_scene(self, subject: Subject) -> Values:
         """Numbers of the reconstruction as a whole."""
         return {}
+
+
+def shows_enough(view: SeenView | UnseenView) -> bool:
+    """Whether enough pixels of the picture count; without them the view has no numbers, like one without a camera in the scene."""
+    return view.valid is None or int(view.valid.sum()) >= FEWEST_PIXELS
 
 
 def known_values(measure: Measure, values: Values) -> dict[str, float]:

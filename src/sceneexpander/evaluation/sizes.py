@@ -43,7 +43,8 @@ class SizeMetrics:
     """What a camera sees of the reconstruction when its picture is drawn at another size than the stored one, against the photo.
 
     ``open_share`` is the share of pixels that show something in the photo and where the reconstruction's alpha is below 0.9: one looks
-    through it. The others compare with the photo brought to that size; None where it has not that many pixels.
+    through it. The others compare with the photo brought to that size; None where it has not that many pixels. ST-LPIPS, by far the
+    dearest, is measured at the photo's own size only.
     """
 
     open_share: float
@@ -76,7 +77,8 @@ def at_sizes(
     for name in names:
         size = (int(photo.shape[1]), int(photo.shape[2])) if name == "own" else _times(stored, _TIMES[name])
         if min(size) >= WINDOW:
-            found[name] = _at_size(reconstruction, index, photo, valid, size, config)
+            perceptual = config.st_lpips and name == "own"
+            found[name] = _at_size(reconstruction, index, photo, valid, size, perceptual=perceptual)
     return found
 
 
@@ -91,7 +93,8 @@ def _at_size(
     photo: Float[Tensor, "3 photo_height photo_width"],
     valid: Bool[Tensor, "height width"] | None,
     size: tuple[int, int],
-    config: EvaluateConfig,
+    *,
+    perceptual: bool,
 ) -> SizeMetrics:
     stored_height, stored_width = reconstruction.depth.shape[1:]
     height, width = size
@@ -110,15 +113,15 @@ def _at_size(
     if size != tuple(photo.shape[1:]):
         wanted = functional.interpolate(photo[None], size=size, mode="bicubic", antialias=True)[0].clamp(0, 1)
     picture = seen.rgb[0]
-    perceptual = None
-    if config.st_lpips and min(size) >= _LEAST_SIDE_PX:
+    distance = None
+    if perceptual and min(size) >= _LEAST_SIDE_PX:
         everywhere = 1.0 if shown is None else shown
-        perceptual = st_lpips(picture * everywhere, wanted * everywhere)
+        distance = st_lpips(picture * everywhere, wanted * everywhere)
     return SizeMetrics(
         open_share=open_share,
         psnr_db=min(psnr(picture, wanted, shown), PSNR_CAP_DB),
         ssim=ssim(picture, wanted, shown),
-        st_lpips=perceptual,
+        st_lpips=distance,
     )
 
 
@@ -129,8 +132,9 @@ class AtOtherSizes(Measure):
         *(
             name.format(where)
             for where in (*_CAPTURED.values(), *_INSERTED.values())
-            for name in ("psnr_{}_db", "ssim_{}", "st_lpips_{}", "seen_through_{}")
-        )
+            for name in ("psnr_{}_db", "ssim_{}", "seen_through_{}")
+        ),
+        *(f"st_lpips_{names['own']}" for names in (_CAPTURED, _INSERTED)),
     )
 
     def of_view(self, view: SeenView) -> Values:
@@ -142,6 +146,7 @@ class AtOtherSizes(Measure):
             where = names[size]
             values[f"psnr_{where}_db"] = measured.psnr_db
             values[f"ssim_{where}"] = measured.ssim
-            values[f"st_lpips_{where}"] = measured.st_lpips
+            if size == "own":
+                values[f"st_lpips_{where}"] = measured.st_lpips
             values[f"seen_through_{where}"] = measured.open_share
         return values

@@ -6,7 +6,7 @@ Photos are compared at their own resolution first, and at the stored size that t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from sceneexpander.artifacts.metrics import MetricsRow, Row, UnavailableRow
 from sceneexpander.catalogue import Group, Metric, Shown, Table, measured_metrics
@@ -14,6 +14,7 @@ from sceneexpander.catalogue.methods import CAPTURED, method_order, method_title
 from sceneexpander.catalogue.metrics import DASH
 
 MISSING = "missing"
+NO_COMMON_CELL = "no common cell"
 _GAINED = "tour_covered_gained"  # a difference of two rows
 
 
@@ -26,14 +27,16 @@ Cell = tuple[str, int, int]  # scene, round, seed
 
 
 def comparison_table(rows: Sequence[Row], metrics: Sequence[Metric] | None = None) -> Table:
-    """One line per method: the mean over all scene, round and seed cells that occur in ``rows`` for any method.
+    """One line per method: means over scene, round and seed cells.
 
-    A method that could be run in no cell has its reason in the first number's place.
+    The means of a column are over the same cells: those in which all methods that have the number anywhere have it. If these are fewer
+    than occur in ``rows``, their count follows, e.g. ``21.40 (3/4)``; a method without the number says ``missing``, and
+    ``no common cell`` stands where the methods share none. A method that could be run in no cell has its reason in the first number's
+    place, and narrows no column.
 
-    A mean over fewer cells than there are is followed by its count, e.g. ``21.40 (3/4)``; without any value the cell says ``missing``.
     Of methods that were run several times, the standard deviation over the runs follows (root mean square over the cells).
-    Columns that no row has a value for are left out. Means of lines with different counts cannot be compared, nor lines whose Gaussians
-    were treated differently (``Gaussians``, see `Fit`).
+    Columns that no row has a value for are left out. Lines whose Gaussians were treated differently cannot be compared (``Gaussians``,
+    see `Fit`).
 
     Args:
         rows: of any scenes, rounds, methods and seeds.
@@ -45,10 +48,11 @@ def comparison_table(rows: Sequence[Row], metrics: Sequence[Metric] | None = Non
     by_key = _indexed(rows)
     cells = _cells(rows)
     shown = _shown(by_key, metrics)
+    common = {metric.name: _common_cells(by_key, cells, _methods(rows), metric) for metric in shown}
     lines = []
     for method in _methods(rows):
         done = str(sum((cell, method) in by_key for cell in cells))
-        values = _cell_texts(rows, by_key, cells, method, shown)
+        values = _cell_texts(rows, by_key, cells, method, shown, common)
         lines.append((_title(rows, method), _fits(by_key, cells, method), done, *values))
     header = ("method", "Gaussians", f"cells of {len(cells)}", *(metric.column for metric in shown))
     return Table(header=header, lines=tuple(lines), left=2)
@@ -61,7 +65,8 @@ def scene_table(rows: Sequence[Row], metrics: Sequence[Metric] | None = None) ->
     lines = []
     for cell in _cells(rows):
         for method in _methods(rows):
-            values = _cell_texts(rows, by_key, [cell], method, shown)
+            own = {metric.name: [cell] for metric in shown}
+            values = _cell_texts(rows, by_key, [cell], method, shown, own)
             title, fit = _title(rows, method), _fits(by_key, [cell], method)
             lines.append((cell[0], str(cell[1]), str(cell[2]), title, fit, *values))
     header = ("scene", "round", "seed", "method", "Gaussians", *(metric.column for metric in shown))
@@ -103,6 +108,7 @@ def _cell_texts(
     cells: Sequence[Cell],
     method: str,
     metrics: Sequence[Metric],
+    common: Mapping[str, Sequence[Cell]],
 ) -> list[str]:
     """The line's numbers; where the method could be run in none of the cells: why, then gaps."""
     if not any((cell, method) in by_key for cell in cells):
@@ -115,7 +121,15 @@ def _cell_texts(
         ]
         if reasons:
             return [*dict.fromkeys(reasons), *[DASH] * len(metrics)][: len(metrics)]
-    return [_cell_text(by_key, cells, method, metric) for metric in metrics]
+    return [_cell_text(by_key, cells, common[metric.name], method, metric) for metric in metrics]
+
+
+def _common_cells(
+    by_key: dict[tuple[Cell, str], MetricsRow], cells: Sequence[Cell], methods: Sequence[str], metric: Metric
+) -> list[Cell]:
+    """Cells that all methods have which have the number in any."""
+    known = [{cell for cell in cells if _value(by_key, cell, method, metric) is not None} for method in methods]
+    return [cell for cell in cells if all(cell in own for own in known if own)]
 
 
 def _fits(by_key: dict[tuple[Cell, str], MetricsRow], cells: Sequence[Cell], method: str) -> str:
@@ -140,16 +154,24 @@ def _value(by_key: dict[tuple[Cell, str], MetricsRow], cell: Cell, method: str, 
     return None if covered is None or after is None else after - covered
 
 
-def _cell_text(by_key: dict[tuple[Cell, str], MetricsRow], cells: Sequence[Cell], method: str, metric: Metric) -> str:
+def _cell_text(
+    by_key: dict[tuple[Cell, str], MetricsRow],
+    cells: Sequence[Cell],
+    common: Sequence[Cell],
+    method: str,
+    metric: Metric,
+) -> str:
     if metric.scope.of_insertion and method == CAPTURED:
         return DASH
-    values = [value for cell in cells if (value := _value(by_key, cell, method, metric)) is not None]
-    if not values:
+    if all(_value(by_key, cell, method, metric) is None for cell in cells):
         return MISSING
+    values = [value for cell in common if (value := _value(by_key, cell, method, metric)) is not None]
+    if not values:
+        return NO_COMMON_CELL
     text = metric.bare(sum(values) / len(values))
     spreads = [
-        row.spread[metric.name] for cell in cells if (row := by_key.get((cell, method))) and metric.name in row.spread
+        row.spread[metric.name] for cell in common if (row := by_key.get((cell, method))) and metric.name in row.spread
     ]
     if spreads:
         text += f" \u00b1 {metric.bare(math.sqrt(sum(value * value for value in spreads) / len(spreads)))}"
-    return text if len(values) == len(cells) else f"{text} ({len(values)}/{len(cells)})"
+    return text if len(common) == len(cells) else f"{text} ({len(common)}/{len(cells)})"

@@ -17,14 +17,13 @@ from sceneexpander.artifacts.truth import SceneTruth, ViewTruth, check_size
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.image import WINDOW, psnr, ssim
-from sceneexpander.evaluation.measure import Measure, Subject, Values
+from sceneexpander.evaluation.measure import FEWEST_PIXELS, Measure, Subject, Values
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.geometry.camera import pixel_centres
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.geometry.similarity import umeyama
 
 _WITHIN = 1.25
-_FEWEST_PIXELS = 64  # fewer say nothing about a region
 _MARGIN = WINDOW // 2  # pixels at the border are no centre of a window of SSIM
 _SHORT_BASELINE = 1e-6  # of the largest one: no direction
 
@@ -128,7 +127,7 @@ class InsertedRegions(Measure):
             counted = torch.ones_like(new) if view.valid is None else view.valid
             for name, region in (("new", new & counted), ("seen", ~new & counted)):
                 inner = region[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
-                if int(inner.sum()) >= _FEWEST_PIXELS:
+                if int(inner.sum()) >= FEWEST_PIXELS:
                     rgb = view.render.rgb[0]
                     values[f"psnr_inserted_{name}_db"] = min(psnr(rgb, view.picture, region), PSNR_CAP_DB)
                     values[f"ssim_inserted_{name}"] = ssim(rgb, view.picture, region)

@@ -9,6 +9,7 @@ Pixels of a picture that do not show the place (`ViewSet.valid`) count in none o
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 import torch
@@ -23,7 +24,15 @@ from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.ghosting import find_ghosting
 from sceneexpander.evaluation.image import psnr, ssim
-from sceneexpander.evaluation.measure import Measure, SeenView, Subject, Values, known_values
+from sceneexpander.evaluation.measure import (
+    FEWEST_PIXELS,
+    Measure,
+    SeenView,
+    Subject,
+    Values,
+    known_values,
+    shows_enough,
+)
 from sceneexpander.evaluation.perceptual import st_lpips
 from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.geometry.cameras import Cameras
@@ -31,7 +40,7 @@ from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import align_views
 from sceneexpander.splatting import render
 
-_FEWEST_PIXELS = 64  # fewer covered pixels say nothing about a picture
+_log = logging.getLogger(__name__)
 
 
 @torch.no_grad()
@@ -40,10 +49,17 @@ def navigation_coverage(
 ) -> Float[Tensor, "frame"]:
     """Share of pixels with alpha above the threshold, for each frame of a navigation in the reconstruction's own frame.
 
-    Coverage gained by an expansion is the difference of the means after and before, on the same frames: see `same_place`.
+    Coverage gained by an expansion is the difference of the means after and before, on the same frames: see `same_place`. A camera that
+    comes again (tours return) is drawn once.
     """
-    shares = [render(reconstruction.gaussians, path[frame]).alpha[0] for frame in range(len(path))]
-    return (torch.stack(shares) > config.coverage_alpha).to(torch.float32).mean(dim=(1, 2))
+    shares: list[Tensor] = []
+    for frame, first in enumerate(path.find_repeats()):
+        if first < frame:
+            shares.append(shares[first])
+            continue
+        alpha = render(reconstruction.gaussians, path[frame]).alpha[0]
+        shares.append((alpha > config.coverage_alpha).to(torch.float32).mean())
+    return torch.stack(shares)
 
 
 def same_place(
@@ -110,8 +126,13 @@ def measure_views(seen: Sequence[SeenView], measures: Sequence[Measure], *, gene
         if view.generated != generated:
             continue
         values: dict[str, float] = {}
-        for measure in measures:
-            values |= known_values(measure, measure.of_view(view))
+        if not shows_enough(view):
+            _log.warning(
+                "%s: too little of the picture shows the place: no numbers", view.reconstruction.view_ids[view.index]
+            )
+        else:
+            for measure in measures:
+                values |= known_values(measure, measure.of_view(view))
         for name in values:
             if metric_named(name).scope.views is not kind:
                 raise ValueError(f"{name!r} is not a metric of {kind} views")
@@ -132,8 +153,6 @@ def _see_view(
     """A view of a reconstruction drawn at its own camera, beside its picture, which is the one at ``place`` in ``views``."""
     picture = views.images[place]
     valid = None if views.valid is None else views.valid[place]
-    if valid is not None and int(valid.sum()) < _FEWEST_PIXELS:
-        valid = None
     camera = (reconstruction.world_from_cam[index : index + 1], reconstruction.intrinsics_px[index : index + 1])
     return SeenView(
         reconstruction=reconstruction,
@@ -222,7 +241,7 @@ class FromOthers(Measure):
         camera = (whole.world_from_cam[index : index + 1], whole.intrinsics_px[index : index + 1])
         seen = render(others, Cameras(*camera, *view.picture.shape[1:]))
         covered = (seen.alpha[0] > view.config.coverage_alpha) & counted
-        if int(covered.sum()) < _FEWEST_PIXELS:
+        if int(covered.sum()) < FEWEST_PIXELS:
             return _share(covered, counted), None, None, None
         # Divided by alpha: what is compared is the colour that is there, not the black behind it.
         colour = seen.rgb[0] / seen.alpha[0].clamp(min=1e-6)

@@ -1,4 +1,4 @@
-"""LPIPS and FLIP: how different two pictures look, by measures that others report.
+"""LPIPS, FLIP and CVVDP: how different two pictures look, by measures that others report.
 
 - LPIPS (Zhang et al., CVPR 2018), version 0.1, AlexNet: RGB in [-1, 1], normalised; after each of the five rectifiers the squared
   differences of features scaled to unit length, weighted by the published heads; means over positions, added up. The network is written
@@ -6,8 +6,9 @@
   ``alexnet-owt-7be5be79.pth``, or the same as safetensors), the heads from the installed package ``lpips``, of which no code is run.
 - FLIP (Andersson et al., HPG 2020) for ordinary pictures, by NVIDIA's package ``flip-evaluator``: sRGB, 67 pixels per degree; the mean of
   its map over the pixels that count.
+- ColorVideoVDP: see `evaluation.cvvdp`.
 
-Both are 0 for equal pictures.
+The first two are 0 for equal pictures.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from torch.nn import functional
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.cvvdp import cvvdp
 from sceneexpander.evaluation.measure import Measure, SeenView, UnseenView, Values
 from sceneexpander.plainfiles import require_plain_file
 
@@ -159,10 +161,10 @@ def _pair(image: Tensor, reference: Tensor) -> Float[Tensor, "2 3 height width"]
 
 
 class Visual(Measure):
-    """Both at the stored size; pixels that do not count are black on both sides for LPIPS and left out of FLIP's mean."""
+    """All at the stored size; pixels that do not count are black on both sides for LPIPS and CVVDP and left out of FLIP's mean."""
 
     metrics = metrics_named(
-        *(f"{kind}_{views}" for kind in ("lpips", "flip") for views in ("captured", "inserted", "held_out"))
+        *(f"{kind}_{views}" for kind in ("lpips", "flip", "cvvdp") for views in ("captured", "inserted", "held_out"))
     )
 
     def of_view(self, view: SeenView) -> Values:
@@ -186,4 +188,6 @@ def _looks(
     if config.flip:
         error = flip_map(image, picture)
         values[f"flip_{views}"] = None if error is None else float(error[counted].double().mean())
+    if config.cvvdp:
+        values[f"cvvdp_{views}"] = cvvdp(image.cpu() * counted, picture.cpu() * counted)
     return values

@@ -59,6 +59,7 @@ from sceneexpander.expandbench.scenes import (
 )
 from sceneexpander.files import directory_being_written
 from sceneexpander.geometry.camera import unproject_to_world
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.ingest.decode import read_picture
 from sceneexpander.synthetic.bundled import unseen_by
 
@@ -151,7 +152,7 @@ def picture_of(view: str) -> str:
 
 def true_details(drawn: DrawnScene) -> dict[str, TrueDetail]:
     """The truth about all views of a scene."""
-    rendered, poses, intrinsics = drawn.rendered, drawn.world_from_cam, drawn.intrinsics_px
+    rendered, cameras = drawn.rendered, drawn.cameras
     pictures, relative = drawn.pictures(), torch.from_numpy(drawn.relative)
     found = {}
     for index, name in enumerate(VIEWS):
@@ -160,24 +161,22 @@ def true_details(drawn: DrawnScene) -> dict[str, TrueDetail]:
             image=pictures[index],
             depth=torch.from_numpy(np.where(np.isfinite(depth), depth, np.float32(0))),
             normals=torch.from_numpy(rendered.normals[index].astype(np.float16)),
-            seen=torch.from_numpy(_seen(index, rendered.depth, poses, intrinsics)),
+            seen=torch.from_numpy(_seen(index, rendered.depth, cameras)),
             world_from_cam=relative[index],
-            intrinsics_px=torch.from_numpy(intrinsics),
+            intrinsics_px=cameras.intrinsics_px[index].clone(),
         )
     return found
 
 
-def _seen(
-    index: int, depths: NDArray[Any], poses: NDArray[np.float64], intrinsics: NDArray[np.float64]
-) -> NDArray[np.uint8]:
-    depth, pose = depths[index], poses[index]
+def _seen(index: int, depths: NDArray[Any], cameras: Cameras) -> NDArray[np.uint8]:
+    depth, camera = depths[index], cameras[index]
     photographed = np.full(depth.shape, index < CAPTURED)
     if index >= CAPTURED:
-        photographed = ~unseen_by(depth, pose, depths[:CAPTURED], poses[:CAPTURED], intrinsics)
+        photographed = ~unseen_by(depth, camera, depths[:CAPTURED], cameras[:CAPTURED])
     intended = np.full(depth.shape, index == CAPTURED)
     if index > CAPTURED:
         only = slice(CAPTURED, CAPTURED + 1)
-        intended = ~unseen_by(depth, pose, depths[only], poses[only], intrinsics)
+        intended = ~unseen_by(depth, camera, depths[only], cameras[only])
     seen = np.where(photographed, Seen.CAPTURED, np.where(intended, Seen.EXPANDED, Seen.UNKNOWN))
     return np.where(np.isfinite(depth), seen, Seen.NOTHING).astype(np.uint8)
 
@@ -259,7 +258,7 @@ def write_scene(name: str, folder: Path, *, shrink: int = 1, grades: Collection[
 
 
 def _write_inserted(target: _Folder, scene: BenchScene, grades: Collection[str]) -> None:
-    first_from_world = np.linalg.inv(scene.cameras[0])
+    first_from_world = np.linalg.inv(scene.cameras.world_from_cam[0].numpy())
     wrong = {}
     for grade in grades:
         drawn = scene.draw(PICTURED[grade].misalignment)

@@ -17,10 +17,10 @@ from sceneexpander.expandbench.studies import REFERENCES, STUDIES, Study
 from sceneexpander.expandbench.table import (
     acceptance_table,
     alone_table,
+    compare_rows,
     components_table,
     curve_table,
     main_table,
-    paired,
     paired_table,
     scenes_table,
 )
@@ -241,7 +241,7 @@ def _in_short(results: Results) -> list[str]:
 
 
 def _said(cells: Sequence[CellResult], row: str, against: str, column: Metric) -> str | None:
-    found = paired(cells, row, column, against=against)
+    found = compare_rows(cells, row, column, against=against)
     if found is None:
         return None
     spread = "" if found.seed_spread is None else f" ± {column.bare(found.seed_spread)}"

@@ -8,7 +8,7 @@ from pathlib import Path
 from sceneexpander.catalogue import Metric
 from sceneexpander.expandbench.grades import GRADES
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
-from sceneexpander.expandbench.table import COLUMNS, paired, row_names
+from sceneexpander.expandbench.table import COLUMNS, compare_rows, row_names
 
 UNITS = {
     "rotation": "degrees, camera estimated",
@@ -28,7 +28,7 @@ def curve(cells: Sequence[CellResult], row: str, axis: str, column: Metric) -> l
     points = []
     for grade in [GRADES[start], *(grade for grade in GRADES.values() if grade.axis == axis)]:
         here = [cell for cell in cells if cell.row == CAPTURED or (cell.row == row and cell.grade == grade.name)]
-        found = paired(here, row, column, against=CAPTURED)
+        found = compare_rows(here, row, column, against=CAPTURED)
         if found is not None:
             points.append((0.0 if grade.name == start else grade.amount, column.factor * found.mean))
     return points

@@ -41,14 +41,14 @@ def without_power(method: MethodConfig, compared: MethodConfig) -> str | None:
     return f"no power at {row.steps} steps: {'; '.join(reasons)}"
 
 
-def touched(config: AdaptConfig) -> float:
+def share_restored(config: AdaptConfig) -> float:
     """Share of the weights that restoration puts back at least once in the whole run."""
     times = config.steps // config.restore_interval if config.restore_interval else 0
     return float(1 - (1 - config.restore_rate) ** times)
 
 
 def _restoration(row: AdaptConfig, reference: AdaptConfig) -> str | None:
-    own, other = touched(row), touched(reference)
+    own, other = share_restored(row), share_restored(reference)
     if abs(own - other) >= LEAST_TOUCHED:
         return None
     return f"restoration touches {100 * own:.1f} % of the weights, {100 * other:.1f} % in the other"

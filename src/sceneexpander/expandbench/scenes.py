@@ -8,7 +8,7 @@ is new. Which seeds are used was settled before any method was run: see `DEVELOP
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,14 @@ from torch import Tensor
 
 from sceneexpander.artifacts.truth import SceneTruth, ViewTruth
 from sceneexpander.artifacts.views import ViewRecord, ViewSet, to_uint8
+from sceneexpander.geometry.camera import resize_intrinsics
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.synthetic.bundled import unseen_by
 from sceneexpander.synthetic.degrade import auto_exposure, encode_radiance
 from sceneexpander.synthetic.misalign import MisalignedView, Misalignment, misalign
 from sceneexpander.synthetic.render import RenderedViews, render_world, trace_camera
 from sceneexpander.synthetic.scenes import KINDS, build_world
-from sceneexpander.synthetic.trajectories import pose_from_angles
+from sceneexpander.synthetic.trajectories import pose_from_angles, same_lens
 from sceneexpander.synthetic.world import World, rotation_z
 
 HEIGHT, WIDTH = 168, 224  # of the stored pictures
@@ -103,15 +105,15 @@ class TrueView:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BenchScene:
-    """A scene before anything is inserted. ``cameras`` are in the world's frame (numpy), the last one is the intended inserted view's.
+    """A scene before anything is inserted. ``cameras`` are those of the detail pictures, in the world's frame (double precision); the last
+    one is the intended inserted view's.
 
     ``between`` is a camera half-way from the nearest captured view to the intended one, which no method is given: ghosting shows there.
     """
 
     name: str
     world: World
-    cameras: NDArray[np.float64]
-    intrinsics_px: NDArray[np.float64]  # of the detail pictures
+    cameras: Cameras
     exposure: float
     captured: ViewSet
     captured_truth: dict[str, ViewTruth]  # by the picture's digest
@@ -125,13 +127,10 @@ class BenchScene:
 
     def draw(self, misalignment: Misalignment, *, seed: int = 0) -> MisalignedView:
         """The inserted picture, in detail pixels, as a generator with these errors draws it, with the record of what is wrong where."""
-        assert self.captured.detail_images is not None  # noqa: S101 - scenes are made with them
-        height, width = self.captured.detail_images.shape[-2:]
         digest = hashlib.sha256(f"{self.name}:{seed}".encode()).digest()
         generator = np.random.default_rng(int.from_bytes(digest[:8], "big"))
         return misalign(
-            self.world, self.cameras[-1], self.intrinsics_px, height, width, misalignment, generator,
-            exposure=self.exposure, supersample=1.0,
+            self.world, self.cameras[-1], misalignment, generator, exposure=self.exposure, supersample=1.0
         )  # fmt: skip
 
     def insert(self, misalignment: Misalignment, *, seed: int = 0) -> tuple[ViewSet, SceneTruth]:
@@ -143,7 +142,7 @@ class BenchScene:
         view = _view_set([_picture(drawn.image)], ["inserted"], generated=True)
         truth = ViewTruth(
             world_from_cam=self.intended.world_from_cam.double(),
-            intrinsics_px=torch.from_numpy(self.intrinsics_px),
+            intrinsics_px=self.cameras.intrinsics_px[-1].clone(),
             depth=_enlarged(self.intended.depth),
             new_region=_enlarged(self.intended.new_region),
         )
@@ -152,19 +151,19 @@ class BenchScene:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrawnScene:
-    """All true views of a scene, at the size of its photographs: `VIEWS` in this order, poses in the world's frame."""
+    """All true views of a scene, at the size of its photographs: `VIEWS` in this order, ``cameras`` in the world's frame."""
 
     name: str
     world: World
-    world_from_cam: NDArray[np.float64]
-    intrinsics_px: NDArray[np.float64]
+    cameras: Cameras
     exposure: float
     rendered: RenderedViews
 
     @property
     def relative(self) -> NDArray[np.float64]:
         """Poses in the first captured view's frame."""
-        poses = np.linalg.inv(self.world_from_cam[0]) @ self.world_from_cam
+        poses = self.cameras.world_from_cam.numpy()
+        poses = np.linalg.inv(poses[0]) @ poses
         poses[0] = np.eye(4)
         return poses
 
@@ -186,19 +185,18 @@ def draw_scene(name: str, *, shrink: int = 1) -> DrawnScene:
     """
     kind, seed = _DRAWN[name]
     height, width = HEIGHT * DETAIL // shrink, WIDTH * DETAIL // shrink
-    world, poses, intrinsics = _world_and_cameras(kind, seed)
-    intrinsics[:2] /= shrink
+    world, cameras = _world_and_cameras(kind, seed)
+    cameras = cameras.resized(height, width)
     # Half-way to the intended view from the captured view nearest to it.
+    poses = cameras.world_from_cam.numpy()
     distance = np.linalg.norm(poses[:-1, :3, 3] - poses[-1, :3, 3], axis=-1)
-    halfway = _halfway(poses[int(distance.argmin())], poses[-1])
-    every = np.stack([*poses, halfway, _beside(world, poses, intrinsics, height, width)])
-    many = np.broadcast_to(intrinsics, (len(every), 3, 3))
-    rendered = render_world(world, every, many, height, width, supersample=1.0, seed=seed)
+    halfway = _moved_to(cameras[-1], _halfway(poses[int(distance.argmin())], poses[-1]))
+    cameras = cameras.followed_by(halfway).followed_by(_beside(world, cameras))
+    rendered = render_world(world, cameras, supersample=1.0, seed=seed)
     return DrawnScene(
         name=name,
         world=world,
-        world_from_cam=every,
-        intrinsics_px=intrinsics,
+        cameras=cameras,
         exposure=auto_exposure(rendered.radiance[:CAPTURED]),
         rendered=rendered,
     )
@@ -206,37 +204,34 @@ def draw_scene(name: str, *, shrink: int = 1) -> DrawnScene:
 
 def bench_scene(drawn: DrawnScene) -> BenchScene:
     """The scene as methods are given it, with the truth that they are measured against."""
-    pictures, every, rendered, intrinsics = drawn.pictures(), drawn.world_from_cam, drawn.rendered, drawn.intrinsics_px
-    poses = every[: CAPTURED + 1]
+    pictures, cameras, rendered = drawn.pictures(), drawn.cameras, drawn.rendered
+    photographs, lenses = cameras[:CAPTURED], cameras.intrinsics_px
     ids = [f"{index:03d}_captured" for index in range(CAPTURED)]
     captured = _view_set(pictures[:CAPTURED], ids, generated=False)
     relative = torch.from_numpy(drawn.relative)
     truth = {
         record.sha256: ViewTruth(
             world_from_cam=relative[index],
-            intrinsics_px=torch.from_numpy(intrinsics),
+            intrinsics_px=lenses[index].clone(),
             depth=_known(rendered.depth[index]),
         )
         for index, record in enumerate(captured.records)
     }
 
     def true_view(index: int) -> TrueView:
-        unseen = unseen_by(rendered.depth[index], every[index], rendered.depth[:CAPTURED], poses[:CAPTURED], intrinsics)
-        small = intrinsics.copy()
-        small[:2] /= DETAIL
+        unseen = unseen_by(rendered.depth[index], cameras[index], rendered.depth[:CAPTURED], photographs)
         return TrueView(
             image=_shrunk(pictures[index]),
             depth=_known(rendered.depth[index])[_every_second()],
             new_region=torch.from_numpy(unseen)[_every_second()],
             world_from_cam=relative[index].float(),
-            intrinsics_px=torch.from_numpy(small).float(),
+            intrinsics_px=resize_intrinsics(lenses[index], 1 / DETAIL, 1 / DETAIL).float(),
         )
 
     return BenchScene(
         name=drawn.name,
         world=drawn.world,
-        cameras=poses,
-        intrinsics_px=intrinsics,
+        cameras=cameras[: CAPTURED + 1],
         exposure=drawn.exposure,
         captured=captured,
         captured_truth=truth,
@@ -245,17 +240,19 @@ def bench_scene(drawn: DrawnScene) -> BenchScene:
     )
 
 
-def _world_and_cameras(kind: str, seed: int) -> tuple[World, NDArray[np.float64], NDArray[np.float64]]:
-    """(world, poses with the intended inserted view last, intrinsics of the detail pictures)."""
+def _world_and_cameras(kind: str, seed: int) -> tuple[World, Cameras]:
+    """(world, cameras of the detail pictures with the intended inserted view last)."""
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, attempt, 20_260_101])
         world = build_world(rng, kind, split="test")
         focal = float(rng.uniform(*FOCAL)) * WIDTH * DETAIL
-        intrinsics = np.array([[focal, 0, WIDTH * DETAIL / 2], [0, focal, HEIGHT * DETAIL / 2], [0, 0, 1.0]])
         for _ in range(_WALKS):
             poses = _walk(world, rng)
-            if poses is not None and _fits(world, poses, intrinsics):
-                return world, poses, intrinsics
+            if poses is None:
+                continue
+            cameras = same_lens(poses, focal, HEIGHT * DETAIL, WIDTH * DETAIL)
+            if _fits(world, cameras):
+                return world, cameras
     raise ValueError(f"no suitable cameras for kind {kind!r}, seed {seed} in {_ATTEMPTS} worlds")
 
 
@@ -310,35 +307,39 @@ def _wrapped(angle: float) -> float:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _fits(world: World, poses: NDArray[np.float64], intrinsics: NDArray[np.float64]) -> bool:
+def _fits(world: World, cameras: Cameras) -> bool:
     """Inside the world, nothing in the way, and the last view sees neither too little nor too much that is new."""
-    eyes = poses[:, :3, 3]
+    eyes = cameras.centres.numpy()
     inside = bool(((eyes >= world.bounds[0] - 1e-6) & (eyes <= world.bounds[1] + 1e-6)).all())
     if not inside or float(world.clearance(eyes).min()) < MIN_CLEARANCE_M:
         return False
-    rows, columns = _PROBE
-    small = intrinsics.copy()
-    small[0] *= columns / (WIDTH * DETAIL)
-    small[1] *= rows / (HEIGHT * DETAIL)
-    depths = np.stack([trace_camera(world, pose, small, rows, columns)[0] for pose in poses])
+    small = cameras.resized(*_PROBE)
+    depths = _traced(world, small)
     solid = np.isfinite(depths)
     if float(depths.min()) < MIN_DEPTH_M or float(solid.mean((1, 2)).min()) < MIN_SOLID:
         return False
-    unseen = float(unseen_by(depths[-1], poses[-1], depths[:-1], poses[:-1], small).mean())
+    unseen = float(unseen_by(depths[-1], small[-1], depths[:-1], small[:-1]).mean())
     return UNSEEN_LIMITS[0] <= unseen <= UNSEEN_LIMITS[1]
 
 
-def _beside(
-    world: World, poses: NDArray[np.float64], intrinsics: NDArray[np.float64], height: int, width: int
-) -> NDArray[np.float64]:
+def _traced(world: World, cameras: Cameras) -> NDArray[Any]:
+    """(V,H,W) z-depth, +inf for sky."""
+    return np.stack([trace_camera(world, cameras[index])[0] for index in range(len(cameras))])
+
+
+def _moved_to(camera: Cameras, world_from_cam: NDArray[np.float64]) -> Cameras:
+    return replace(camera, world_from_cam=torch.from_numpy(world_from_cam)[None])
+
+
+def _beside(world: World, cameras: Cameras) -> Cameras:
     """A camera some way to the side of the intended one that looks at the same place: nearly all of it is in the pictures of a method.
 
     Raises:
         ValueError: there is no place for it.
     """
-    rows, columns = _PROBE
-    small = np.diag([columns / width, rows / height, 1.0]) @ intrinsics
-    known = np.stack([trace_camera(world, pose, small, rows, columns)[0] for pose in poses])
+    small = cameras.resized(*_PROBE)
+    known = _traced(world, small)
+    poses = cameras.world_from_cam.numpy()
     last = poses[-1]
     reach = BESIDE * float(np.linalg.norm(poses[0, :3, 3] - poses[CAPTURED - 1, :3, 3])) / (2 * WALK)
     away = float(np.median(known[-1][np.isfinite(known[-1])]))
@@ -348,12 +349,13 @@ def _beside(
         # About the vertical of the world, to where the intended view's middle is.
         turn = float(np.arctan2(share * reach, away))
         pose[:3, :3] = rotation_z(turn) @ last[:3, :3]
-        depth = trace_camera(world, pose, small, rows, columns)[0]
+        probe = _moved_to(small[-1], pose)
+        (depth,) = _traced(world, probe)
         solid = np.isfinite(depth)
-        unknown = unseen_by(depth, pose, known, poses, small) & solid
+        unknown = unseen_by(depth, probe, known, small) & solid
         clear = float(world.clearance(pose[None, :3, 3])[0]) >= MIN_CLEARANCE_M and float(depth.min()) >= MIN_DEPTH_M
         if clear and float(unknown.sum()) <= MOST_UNKNOWN * float(solid.sum()):
-            return pose
+            return _moved_to(cameras[-1], pose)
     raise ValueError("no place beside the intended view")
 
 

@@ -65,7 +65,7 @@ def seed_spread(cells: Sequence[CellResult], column: Metric) -> float | None:
     return statistics.stdev(known) if len(known) > 1 and len(known) == len(means) else None
 
 
-def paired(cells: Sequence[CellResult], row: str, column: Metric, *, against: str = BASELINE) -> Paired | None:
+def compare_rows(cells: Sequence[CellResult], row: str, column: Metric, *, against: str = BASELINE) -> Paired | None:
     """A row against another; None if they share no scene, grade and seed with a value. `CAPTURED` is the same for every grade."""
     base = {_pair(c, against): c.numbers.value(column.name) for c in cells if c.row == against}
     own = [c for c in cells if c.row == row]
@@ -113,7 +113,7 @@ def main_table(cells: Sequence[CellResult], columns: Sequence[Metric] = COLUMNS)
 def paired_table(cells: Sequence[CellResult], columns: Sequence[Metric] = COLUMNS) -> str:
     """One line per row: mean difference to the baseline, its spread over seeds, the worst scene's, and how many scenes are better."""
     lines = [
-        [row, *(_difference(paired(cells, row, column), column) for column in columns)]
+        [row, *(_difference(compare_rows(cells, row, column), column) for column in columns)]
         for row in row_names(cells)
         if row not in (CAPTURED, BASELINE)
     ]
@@ -133,7 +133,7 @@ def components_table(
     """
     lines = []
     for row, reference in references.items():
-        found = [paired(cells, row, column, against=reference) for column in columns]
+        found = [compare_rows(cells, row, column, against=reference) for column in columns]
         if all(item is None for item in found):
             continue
         texts = [_difference(item, column) for item, column in zip(found, columns, strict=True)]
@@ -156,7 +156,7 @@ def scenes_table(cells: Sequence[CellResult], rows: Sequence[str], column: Metri
                 value = mean_of([cell for cell in here if cell.row == CAPTURED], column)
                 texts.append(DASH if value is None else column.bare(value))
             else:
-                found = paired(here, row, column, against=against)
+                found = compare_rows(here, row, column, against=against)
                 texts.append(DASH if found is None else column.bare(found.mean, sign=True))
         lines.append([title, *texts])
     return _markdown([column.column, *scenes], lines)
@@ -195,8 +195,8 @@ def curve_table(cells: Sequence[CellResult], rows: Sequence[str], column: Metric
     before = [cell for cell in cells if cell.row == CAPTURED]
     for grade in dict.fromkeys(cell.grade for cell in cells if cell.grade):
         here = [cell for cell in cells if cell.grade == grade]
-        texts = [_difference(paired([*before, *here], BASELINE, column, against=CAPTURED), column)]
-        texts += [_difference(paired(here, row, column), column) for row in rows]
+        texts = [_difference(compare_rows([*before, *here], BASELINE, column, against=CAPTURED), column)]
+        texts += [_difference(compare_rows(here, row, column), column) for row in rows]
         lines.append([grade, *texts])
     return _markdown(["grade", f"insertion's effect on {column.column}", *(f"{row} − baseline" for row in rows)], lines)
 

@@ -37,6 +37,7 @@ from sceneexpander.frontend.fill import interpolate_sparse, pixels_to_nearest, s
 from sceneexpander.frontend.segments import segment_colours
 from sceneexpander.frontend.sgm import COST_SCALE, aggregate, best_hypothesis
 from sceneexpander.frontend.sparse_points import SparsePoints
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 from sceneexpander.ranges import Range, Share, Weight, check_ranges
 
@@ -150,8 +151,7 @@ class _Matched:
 
 def dense_depth(
     images: Float[Tensor, "view 3 height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     sparse: SparsePoints,
     config: DenseConfig,
     *,
@@ -161,15 +161,14 @@ def dense_depth(
 
     Args:
         images: RGB in [0, 1].
-        world_from_cam: camera poses; those of views that are not ``posed`` are ignored.
-        intrinsics_px: in pixels of ``images``.
+        cameras: those of ``images``; poses of views that are not ``posed`` are ignored.
         sparse: triangulated points; may be empty.
         posed: False for views whose pose is only a placeholder; all posed by default.
 
     Raises:
         ValueError: shapes that do not belong together.
     """
-    views, matched, interpolated, limits = _match_views(images, world_from_cam, intrinsics_px, sparse, config, posed)
+    views, matched, interpolated, limits = _match_views(images, cameras, sparse, config, posed)
     depths = [None if m is None else np.reciprocal(m.inverse_depth) for m in matched]
 
     def finish(s: int) -> _Filled:
@@ -182,21 +181,21 @@ def dense_depth(
 
 def _match_views(
     images: Float[Tensor, "view 3 height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     sparse: SparsePoints,
     config: DenseConfig,
     posed: Bool[Tensor, "view"] | None,
 ) -> tuple[list[WorkView], list[_Matched | None], list[Image32], list[tuple[float, float]]]:
     """(views at the working resolution, raw matches, interpolations of the points, limits of inverse depth)."""
     count = images.shape[0]
-    if world_from_cam.shape[0] != count or intrinsics_px.shape[0] != count:
-        raise ValueError(f"{count} images, {world_from_cam.shape[0]} poses and {intrinsics_px.shape[0]} intrinsics")
     height, width = images.shape[-2:]
+    if (len(cameras), cameras.height, cameras.width) != (count, height, width):
+        shown = f"{len(cameras)} cameras of {cameras.height} x {cameras.width}"
+        raise ValueError(f"{count} images of {height} x {width} pixels, {shown}")
     is_posed = np.ones(count, bool) if posed is None else posed.cpu().numpy().astype(bool)
     scale = min(1.0, config.work_px / max(height, width))
     size = (max(2, round(height * scale)), max(2, round(width * scale)))
-    views = prepare_views(images, world_from_cam, intrinsics_px, sparse, is_posed, size=size)
+    views = prepare_views(images, cameras, sparse, is_posed, size=size)
     limits = [_limits(views, s, config) for s in range(count)]
     interpolated = [_interpolation(views, s, limits) for s in range(count)]
 
@@ -221,15 +220,14 @@ def _checked(matched: _Matched, agreement: Agreement, config: DenseConfig) -> ND
 
 def checked_share(
     images: Float[Tensor, "view 3 height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     sparse: SparsePoints,
     config: DenseConfig,
     *,
     posed: Bool[Tensor, "view"],
 ) -> float:
     """Share of all pixels that match another view and lead back: how well cameras fit the pictures. Arguments as `dense_depth`."""
-    views, matched = _match_views(images, world_from_cam, intrinsics_px, sparse, config, posed)[:2]
+    views, matched = _match_views(images, cameras, sparse, config, posed)[:2]
     depths = [None if m is None else np.reciprocal(m.inverse_depth) for m in matched]
     share = 0.0
     for s, found in enumerate(matched):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sceneexpander.frontend.sparse_points import SparsePoints
+from sceneexpander.geometry.cameras import Cameras
 
 Image32 = NDArray[np.float32]
 Array64 = NDArray[np.float64]
@@ -57,8 +58,7 @@ def relative_projection(reference: WorkView, other: WorkView) -> tuple[Array64, 
 
 def prepare_views(
     images: Float[Tensor, "view 3 height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     sparse: SparsePoints,
     posed: NDArray[np.bool_],
     *,
@@ -67,6 +67,7 @@ def prepare_views(
     """Views resized to ``size`` = (height, width), with the cleaned depths of the sparse points they observed."""
     height, width = images.shape[-2:]
     scale = np.array([size[1] / width, size[0] / height])
+    work = cameras.double().resized(*size)
     points = sparse.points_world.detach().cpu().double().numpy()
     view_index, point_index = sparse.view_index.cpu().numpy(), sparse.point_index.cpu().numpy()
     pixel_xy = sparse.pixel_xy.detach().cpu().double().numpy()
@@ -75,9 +76,7 @@ def prepare_views(
         rgb = np.ascontiguousarray(images[s].detach().cpu().float().permute(1, 2, 0).numpy())
         if size != (height, width):
             rgb = cv2.resize(rgb, (size[1], size[0]), interpolation=cv2.INTER_AREA)
-        intrinsics = intrinsics_px[s].detach().cpu().double().numpy().copy()
-        intrinsics[:2] *= scale[:, None]
-        pose = world_from_cam[s].detach().cpu().double().numpy()
+        pose = work.world_from_cam[s].detach().cpu().numpy()
         mine = view_index == s if posed[s] else np.zeros(len(view_index), bool)
         xy = pixel_xy[mine] * scale
         depth = (points[point_index[mine]] - pose[:3, 3]) @ pose[:3, 2]
@@ -89,7 +88,7 @@ def prepare_views(
             WorkView(
                 rgb=rgb,
                 grey=cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY),
-                intrinsics=intrinsics,
+                intrinsics=work.intrinsics_px[s].detach().cpu().numpy(),
                 world_from_cam=pose,
                 posed=bool(posed[s]),
                 seen_xy=xy[keep],

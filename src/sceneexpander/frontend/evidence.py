@@ -11,14 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from sceneexpander.frontend.bundle import LENS_PARAMETERS, LOG_FOCAL, SHIFT_X, SHIFT_Y
 from sceneexpander.frontend.epipolar import EpipolarFit, EpipolarView, OtherView, freedom_of, held_lens
 from sceneexpander.frontend.features import Features
-from sceneexpander.frontend.mapping import Mapping
+from sceneexpander.frontend.mapping import Mapping, directions_between_deg
 from sceneexpander.frontend.rival_poses import direction_changes_deg, largest_rival_angle_deg
 from sceneexpander.frontend.sfm_types import SfmConfig
+from sceneexpander.frontend.tracks import Tracks
 from sceneexpander.frontend.twoview import PairMatches, relative_pose
 
 _AGREE_PX = 3.0  # at 768 px: a match this near its epipolar lines agrees with the cameras
@@ -44,6 +45,7 @@ class ViewEvidence:
             pictures alone leave it uncertain; 0 where they are shared or known from elsewhere.
         rival_angle_deg: how far the directions to the others move if it stood where a flat surface would look the same; 0 where relief
             or a third view rules that out.
+        halves_deg: of `halves_apart_deg`.
         spread_deg: how far the directions to the others move to cameras of another focal (of all views or of this one alone), or of another
             centre for a part cut out of a photo, that explain the photos about as well.
     """
@@ -53,6 +55,7 @@ class ViewEvidence:
     direction_sigma_deg: float
     lens_sigma_deg: float
     rival_angle_deg: float
+    halves_deg: float
     spread_deg: float
 
     def refusal(self, config: SfmConfig) -> str:
@@ -83,6 +86,11 @@ class ViewEvidence:
             return (
                 "what it shares with other photos is flat, and looks the same from another place:"
                 f" its direction may be off by {self.rival_angle_deg:.0f} degrees"
+            )
+        if self.halves_deg > config.max_halves_deg:
+            return (
+                "one half of what it shares with other photos tells another camera than the other half:"
+                f" its direction may be off by {self.halves_deg:.0f} degrees"
             )
         if self.spread_deg > config.max_spread_deg:
             return (
@@ -118,9 +126,43 @@ def weigh_evidence(
                 mapping, view, features, pairs, _own_parameters(mapping, view, hinted=hinted[view])
             ),
             rival_angle_deg=_rival_angle_deg(mapping, view, features, pairs),
+            halves_deg=float(mapping.halves_deg[view]),
             spread_deg=max(float(mapping.spread_deg[view]), _crop_spread_deg(mapping, view, features, pairs)),
         )
     return found
+
+
+def halves_apart_deg(
+    mapping: Mapping, tracks: Tracks, free: Bool[np.ndarray, " view"] | None = None
+) -> Float[np.ndarray, " view"]:
+    """Per view how far (degrees) the directions to the others differ between cameras of one half of the matches and of the other half.
+
+    The halves are left and right, then upper and lower parts of the pictures: wrong matches lie together, and so does what is flat. The
+    worse division counts; 0 where a half says too little.
+
+    Args:
+        mapping: finished model, where each half begins.
+        tracks: of matches that were found before any camera was known. Those found in the epipolar bands of cameras agree with them.
+        free: cameras that may move, as for `Mapping.finish`.
+    """
+    usable = (tracks.seen & mapping.registered).sum(1) >= 2
+    seen = (tracks.seen & mapping.registered)[usable]
+    apart = np.zeros(len(mapping.registered))
+    if len(seen) < 2 * _MIN_MATCHES:
+        return apart
+    views = np.flatnonzero(seen.any(0))
+    at = np.where(seen[:, views, None], tracks.pixel_xy[usable][:, views], np.nan)
+    offset = np.nanmean(at - np.nanmedian(at, axis=0), axis=1)  # (track, 2) from the middle of what each view shares
+    for along in offset.T:
+        first = along < np.median(along)
+        halves = []
+        for side in (first, ~first):
+            half = mapping.over(Tracks(pixel_xy=tracks.pixel_xy[usable][side], seen=tracks.seen[usable][side]))
+            half.finish(refine_focal=False, free=free)
+            half.registered &= half.active.sum(0) >= _MIN_MATCHES
+            halves.append(half)
+        apart = np.maximum(apart, directions_between_deg(halves[0], halves[1:]))
+    return apart
 
 
 def common_doubt(photos: int, *, sure: int, depth: bool, focal_is_guess: bool) -> str:

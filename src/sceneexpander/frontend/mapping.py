@@ -37,6 +37,7 @@ from sceneexpander.frontend.twoview import (
 _TAIL = 4.0  # nu of what is assumed of a focal: at four standard deviations it pulls a fifth as much as a Gaussian
 _PRIOR_INFLATION = 8.0  # matching errors are correlated and partly systematic: that many of them count as one
 _NEIGHBOURS = 8
+_STANDS_TOGETHER = 0.05  # of the widest distance between cameras
 _NEIGHBOUR_GAP = 0.2  # of the logarithm of depth: neighbours nearer than this agree
 
 
@@ -100,6 +101,7 @@ class Mapping:
         self.prior_sigma = np.full((views, LENS_PARAMETERS), np.inf) if prior_sigma is None else prior_sigma
         self.assumed = np.zeros(views, bool) if assumed is None else assumed
         self.spread_deg = np.zeros(views)  # how far directions move to cameras that explain the photos about as well
+        self.halves_deg = np.zeros(views)  # how far directions differ between two halves of the matches
         self.lens_guesses = {} if guesses is None else guesses
         self.crops = {} if crops is None else crops
         self.main = main
@@ -172,6 +174,14 @@ class Mapping:
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 setattr(other, name, value.copy())
+        return other
+
+    def over(self, tracks: Tracks) -> Mapping:
+        """The same cameras and lenses over other tracks of the same views, without points."""
+        other = self.copy()
+        other.tracks = tracks
+        other.points, other.valid = np.zeros((tracks.count, 3)), np.zeros(tracks.count, bool)
+        other.active = np.zeros((tracks.count, len(self.registered)), bool)
         return other
 
     def adopt(self, other: Mapping) -> None:
@@ -541,13 +551,23 @@ class Mapping:
 
 
 def directions_between_deg(model: Mapping, others: Sequence[Mapping]) -> Float[np.ndarray, " view"]:
-    """Per view the median over its neighbours of how far the direction to them moves, in the other model in which that is most; degrees."""
+    """Per view the median over its neighbours of how far the direction to them moves, in the other model in which that is most; degrees.
+
+    Directions between cameras that stand together, as in a burst, say nothing and are not asked.
+    """
     views, most = np.flatnonzero(model.registered), np.zeros(len(model.registered))
+    apart = np.linalg.norm(model.centres[views, None] - model.centres[views], axis=-1)
+    near = np.zeros((len(most), len(most)), bool)
+    near[np.ix_(views, views)] = apart < _STANDS_TOGETHER * apart.max(initial=0.0)
     for other in others:
         for view in views:
             turned = []
             for neighbour in views:
-                if neighbour == view or not (other.registered[view] and other.registered[neighbour]):
+                if (
+                    neighbour == view
+                    or near[view, neighbour]
+                    or not (other.registered[view] and other.registered[neighbour])
+                ):
                     continue
                 a, b = (m.rotations[view] @ (m.centres[neighbour] - m.centres[view]) for m in (model, other))
                 turned.append(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

@@ -15,6 +15,7 @@ from sceneexpander.frontend.lenses import ViewOptics
 from sceneexpander.frontend.memory import MatchMemory
 from sceneexpander.frontend.sfm import Judge, estimate_cameras
 from sceneexpander.frontend.sfm_types import FocalSource, SfmConfig, SparseReconstruction
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.priors import Priors
 
 _JUDGE_PX = 240  # long side at which camera models are compared; half the pixels of the full size
@@ -64,9 +65,8 @@ def build_priors(
         judge=picture_judge(images, config.dense),
     )
     dense = dense_depth(
-        straightened(images, sparse)[0],
-        sparse.world_from_cam,
-        sparse.intrinsics_px,
+        straighten(images, sparse)[0],
+        cameras_of(sparse, images),
         sparse.sparse,
         config.dense,
         posed=sparse.posed,
@@ -79,7 +79,7 @@ def build_priors(
         if note:
             sparse = replace(sparse, report=replace(sparse.report, notes=(*sparse.report.notes, note)))
     scale = 1.0 / float(depth[0].median())
-    sparse = rescaled(sparse, scale)
+    sparse = rescale(sparse, scale)
     priors = Priors(
         world_from_cam=sparse.world_from_cam,
         intrinsics_px=sparse.intrinsics_px,
@@ -99,9 +99,8 @@ def picture_judge(images: Float[Tensor, "view 3 height width"], dense: DenseConf
 
     def judge(candidate: SparseReconstruction) -> float:
         return checked_share(
-            straightened(images, candidate)[0],
-            candidate.world_from_cam,
-            candidate.intrinsics_px,
+            straighten(images, candidate)[0],
+            cameras_of(candidate, images),
             candidate.sparse,
             rough,
             posed=candidate.posed,
@@ -110,7 +109,7 @@ def picture_judge(images: Float[Tensor, "view 3 height width"], dense: DenseConf
     return judge
 
 
-def straightened(
+def straighten(
     images: Float[Tensor, "view 3 height width"], found: SparseReconstruction
 ) -> tuple[Float[Tensor, "view 3 height width"], Bool[Tensor, "view height width"] | None]:
     """The pictures as pinhole cameras see them, and where they show something; as they are (and None) if the lens bends nothing."""
@@ -119,7 +118,13 @@ def straightened(
     return found.distortion.straightened(images.cpu())
 
 
-def rescaled(reconstruction: SparseReconstruction, scale: float) -> SparseReconstruction:
+def cameras_of(found: SparseReconstruction, images: Float[Tensor, "view 3 height width"]) -> Cameras:
+    """What was found as the cameras of these pictures."""
+    height, width = images.shape[-2:]
+    return Cameras(found.world_from_cam, found.intrinsics_px, height, width)
+
+
+def rescale(reconstruction: SparseReconstruction, scale: float) -> SparseReconstruction:
     """The same reconstruction with every length multiplied by ``scale``."""
     world_from_cam = reconstruction.world_from_cam.clone()
     world_from_cam[:, :3, 3] *= scale

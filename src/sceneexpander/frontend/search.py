@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
+from sceneexpander.frontend.evidence import halves_apart_deg
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.lens_tests import find_apart_group, mean_cost, pair_costs, settle_lenses, snap_lenses
 from sceneexpander.frontend.lenses import FocalStart, LensPlan
@@ -79,7 +80,9 @@ class CameraSearch:
             guided.grow(refine_focal=False, free=self._free_views(guided))
             refine = self._finish(guided, refine)
             model = guided
-        if refine:
+        if refine:  # with a focal that is held and a little wrong, halves differ by that
+            apart = halves_apart_deg(model, tracks, self._free_views(model))
+            model.halves_deg = np.where(self.plan.generated, 0.0, apart)  # whether those fit is asked elsewhere
             return model, FocalSource.REFINED
         if self.plan.refine:
             others = [self._moved(model, sign * start.sigma) for sign in (-1, 1)]

@@ -24,7 +24,7 @@ from sceneexpander.generation.protocol import Forecast, GenerationContext, Scene
 from sceneexpander.generation.rank import rank_candidates
 from sceneexpander.generation.sheet import contact_sheet
 from sceneexpander.ingest.load import view_from_fitted
-from sceneexpander.judge import Judge
+from sceneexpander.judge.ask import Judge
 
 logger = logging.getLogger(__name__)
 
@@ -136,7 +136,7 @@ def _inserted(
     if item.picture is None or item.fitted is None:
         raise UserError(item.provenance.refusal or "no picture", where=item.provenance.source)
     view: ViewSet = view_from_fitted(
-        item.picture,
+        item.picture.facts,
         item.fitted,
         view_id=f"{views:03d}_inserted_{context.round_number}",
         generated=True,

@@ -49,7 +49,7 @@ class Misaligned:
 @torch.no_grad()
 def report_misalignment(picture: FittedPicture, so_far: SceneSoFar, *, seed: int) -> Misaligned:
     """Pose a fitted picture against the scene so far and compare."""
-    registered, stretch = explained(register(picture, photo_points(so_far), so_far, seed=seed))
+    registered, stretch = explain_matches(register(picture, photo_points(so_far), so_far, seed=seed))
     if registered.found is None:
         return Misaligned(report=MisalignmentReport(inliers=registered.inliers, matches=registered.matched))
     found = registered.found
@@ -59,7 +59,7 @@ def report_misalignment(picture: FittedPicture, so_far: SceneSoFar, *, seed: int
     own, cover = image_tensor(picture.image), seen.alpha[0] >= _SEEN
     scene = (seen.rgb[0] / seen.alpha[0].clamp(min=_SEEN)).clamp(0, 1)
     gains = tone_gains(own, scene, cover)
-    wrong = contradicted(own, (scene * gains[:, None, None]).clamp(0, 1), cover)
+    wrong = find_contradicted(own, (scene * gains[:, None, None]).clamp(0, 1), cover)
     report = MisalignmentReport(
         inliers=registered.inliers,
         matches=registered.matched,
@@ -92,7 +92,7 @@ def tone_gains(
     return (own[:, cover] / scene[:, cover].clamp(min=1e-3)).median(1).values.clamp(0.25, 4)
 
 
-def contradicted(
+def find_contradicted(
     own: Float[Tensor, "3 height width"], scene: Float[Tensor, "3 height width"], cover: Bool[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:
     """Where the scene shows something else than the picture: cells whose colour no neighbouring cell of the scene has.
@@ -115,7 +115,7 @@ def contradicted(
     return (torch.nn.functional.interpolate(kept, size=(height, width), mode="nearest")[0, 0] > 0.5) & cover
 
 
-def explained(registered: Registration) -> tuple[Registration, float | None]:
+def explain_matches(registered: Registration) -> tuple[Registration, float | None]:
     """(the registration through the lens that explains the matches without more freedom than they ask for, the stretch).
 
     The photos' own focal length is kept unless another one explains clearly more: before a wall focal and distance are one. The stretch is

@@ -11,7 +11,7 @@ from sceneexpander.generation.prompt import split_words
 from sceneexpander.generation.protocol import GenerationContext, SceneSoFar
 from sceneexpander.generation.references import choose_references
 from sceneexpander.ingest.fit import FittedPicture
-from sceneexpander.judge import Judge
+from sceneexpander.judge.ask import Judge
 from sceneexpander.services.pictures import SentPicture, encode_picture
 
 _PHOTOS = 4  # that the judge is shown with a candidate: those nearest to where the motion leads

@@ -75,6 +75,10 @@ class Cameras:
         """The same on a device."""
         return Cameras(self.world_from_cam.to(device), self.intrinsics_px.to(device), self.height, self.width)
 
+    def double(self) -> Cameras:
+        """The same in double precision."""
+        return Cameras(self.world_from_cam.double(), self.intrinsics_px.double(), self.height, self.width)
+
     def followed_by(self, others: Cameras) -> Cameras:
         """These cameras, then others of the same picture size.
 
@@ -89,6 +93,13 @@ class Cameras:
             self.height,
             self.width,
         )
+
+    def find_repeats(self) -> list[int]:
+        """For each camera the index of the first that is the same to the last bit, its own where it is the first."""
+        rows = torch.cat([self.world_from_cam.flatten(1), self.intrinsics_px.flatten(1)], 1)
+        _, group = torch.unique(rows, dim=0, return_inverse=True)
+        first: dict[int, int] = {}
+        return [first.setdefault(number, index) for index, number in enumerate(group.tolist())]
 
     def resized(self, height: int, width: int) -> Cameras:
         """The same cameras with larger or smaller pictures."""

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import (
     look_at,
     quat_wxyz_from_rotation,
@@ -28,12 +29,7 @@ MOST_EXACT = 10  # cameras whose shortest path is searched exhaustively
 GAIN_WORTH_TAKING = 1e-9  # of the path length, ends the improvement of tours in finitely many steps
 
 
-def navigation(
-    world_from_cam: Float[Tensor, "camera 4 4"],
-    intrinsics_px: Float[Tensor, "camera 3 3"],
-    frames: int,
-    order: Sequence[int],
-) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame 3 3"]]:
+def navigation(cameras: Cameras, frames: int, order: Sequence[int]) -> Cameras:
     """A flight through cameras, in the given order (an index may come more than once), starting and ending at rest.
 
     Positions follow a centripetal Catmull-Rom spline (no loops or cusps between keys) and rotations a spherical cubic Bezier
@@ -46,13 +42,14 @@ def navigation(
     keys = list(order)
     if not keys or frames < 1:
         raise ValueError(f"navigation needs at least one key and one frame, got {len(keys)} and {frames}")
-    if not all(0 <= key < world_from_cam.shape[0] for key in keys):
-        raise ValueError(f"navigation order {keys} has an index outside 0..{world_from_cam.shape[0] - 1}")
-    poses, intrinsics = world_from_cam[keys].detach().double(), intrinsics_px[keys].detach().double()
+    if not all(0 <= key < len(cameras) for key in keys):
+        raise ValueError(f"navigation order {keys} has an index outside 0..{len(cameras) - 1}")
+    met = cameras[keys]
+    poses, intrinsics = met.world_from_cam.detach().double(), met.intrinsics_px.detach().double()
     if not bool(torch.isfinite(poses).all() and torch.isfinite(intrinsics).all()):
         raise ValueError("navigation was given cameras that are not finite")
     if len(keys) == 1:
-        return world_from_cam[keys].expand(frames, 4, 4).clone(), intrinsics_px[keys].expand(frames, 3, 3).clone()
+        return met[[0] * frames]
 
     times = _key_times(poses, frames)
     at = torch.arange(frames, dtype=torch.float64, device=poses.device)
@@ -71,7 +68,8 @@ def navigation(
     path_k = torch.zeros(frames, 3, 3, dtype=torch.float64, device=poses.device)
     path_k[:, 0, 0], path_k[:, 1, 1], path_k[:, 0, 2], path_k[:, 1, 2] = fx.exp(), fy.exp(), cx, cy
     path_k[:, 2, 2] = 1
-    return rigid_from_parts(rotation, position).to(world_from_cam), path_k.to(intrinsics_px)
+    path = rigid_from_parts(rotation, position).to(cameras.world_from_cam)
+    return Cameras(path, path_k.to(cameras.intrinsics_px), cameras.height, cameras.width)
 
 
 def shortest_path_order(world_from_cam: Float[Tensor, "camera 4 4"], *, last: int | None = None) -> list[int]:

@@ -83,6 +83,27 @@ class Picture:
         """(rows, columns)."""
         return self.height, self.width
 
+    @property
+    def facts(self) -> PictureFacts:
+        """All but the pixels."""
+        return PictureFacts(name=self.name, height=self.height, width=self.width, sha256=self.sha256, lens=self.lens)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureFacts:
+    """What is to be remembered of a decoded picture. Sizes are those of the upright picture, the digest is of the file's bytes."""
+
+    name: str
+    height: int
+    width: int
+    sha256: str
+    lens: LensFacts
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.height, self.width
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PictureHeader:
@@ -304,20 +325,57 @@ def _upright_size(image: Image.Image, orientation: int) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def _quiet(file_format: str) -> Iterator[None]:
-    """Keep decoders from printing: what is wrong with a file is said once, in one line."""
+def _no_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if file_format not in ("TIFF", "PNG"):
-            yield
-            return
-        # The libraries behind Pillow and OpenCV write to the file descriptor, past Python.
-        kept = os.dup(2)
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        try:
-            os.dup2(nowhere, 2)
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            os.close(nowhere)
+        yield
+
+
+@contextlib.contextmanager
+def _no_messages() -> Iterator[None]:
+    # The libraries behind Pillow and OpenCV write to the file descriptor, past Python.
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+class _WhileAnyoneIsInside(contextlib.AbstractContextManager[None]):
+    """A context of the whole process, entered by the first of several threads and left by the last.
+
+    Each thread keeping and restoring such a state by itself would restore what another one has set.
+    """
+
+    def __init__(self, make: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
+        self._make = make
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._context: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._context = self._make()
+                self._context.__enter__()
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._context.__exit__(None, None, None)
+
+
+_warnings_off, _messages_off = _WhileAnyoneIsInside(_no_warnings), _WhileAnyoneIsInside(_no_messages)
+
+
+@contextlib.contextmanager
+def _quiet(file_format: str) -> Iterator[None]:
+    """Keep decoders from printing: what is wrong with a file is said once, in one line."""
+    with _warnings_off, _messages_off if file_format in ("TIFF", "PNG") else contextlib.nullcontext():
+        yield

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +19,14 @@ from sceneexpander.errors import UserError, did_you_mean, printable
 from sceneexpander.ingest.bars import Bars, find_bars, find_overlay
 from sceneexpander.ingest.config import Fit, IngestConfig
 from sceneexpander.ingest.copies import Thumbnail, is_copy, thumbnail
-from sceneexpander.ingest.decode import Picture, decode_picture, decode_picture_header, pixel_digest, read_picture
+from sceneexpander.ingest.decode import (
+    Picture,
+    PictureFacts,
+    decode_picture,
+    decode_picture_header,
+    pixel_digest,
+    read_picture,
+)
 from sceneexpander.ingest.fit import FittedPicture, FrameSize, common_frame, fit_picture
 from sceneexpander.ingest.known import make_known_cameras
 from sceneexpander.ingest.lens_models import Lens, straighten_picture
@@ -41,6 +49,8 @@ SMALLEST_SIDE_PX = 32
 _MASK_LEVEL = 128  # grey level from which a mask's pixels are used
 _MANY = 4  # photos with the same note share one line
 _CONSTANT_SPREAD = 2.0  # grey levels: below it a picture shows nothing
+# Pictures are worked on side by side as long as they have no more pixels together, which is what a single one may have by default.
+_MEGAPIXELS_AT_ONCE = 200.0
 LITTLE_KEPT = 0.6  # share of a picture's area: losing more than the rest is worth a remark
 
 
@@ -111,35 +121,30 @@ def read_shots(
     shots = [_believed(shot, config) for shot in shots]
     where = _place_of(shots)
     _check_count(len(shots), where, config)
-    usable, frame = _usable(shots, config, notes)
+    usable, frame, largest = _usable(shots, config, notes)
     parts: list[ViewSet] = []
     kept: list[tuple[Shot, FittedPicture, tuple[int, int]]] = []
-    seen: list[_Seen] = []
-    for shot in usable:  # one at a time: thirty camera originals at once would not fit in memory
-        picture, lens = _read_shot(shot, config, notes)
-        shown = printable(picture.name)
-        known = lens is not None or _knows_lens(picture.lens)
-        reason = _nothing_to_see(picture.pixels) or panorama_reason(picture.pixels, picture.xmp, has_lens=known)
-        if reason is not None:
-            notes.append(f"{shown}: {reason}; left out")
+    seen: list[_Read] = []
+    for this in _read_all(usable, frame, config, at_once=max(1, int(_MEGAPIXELS_AT_ONCE / largest))):
+        notes += this.first_notes
+        if this.fitted is None:
+            notes.append(f"{this.shown}: {this.reason}; left out")
             continue
-        this = _Seen(name=shown, digest=pixel_digest(picture), small=thumbnail(picture.pixels), shape=picture.shape)
         twin = next((other for other in seen if other.same_picture(this)), None)
         if twin is not None:
             same = "shows the same pixels as" if twin.digest == this.digest else "is the same picture, saved again, as"
-            notes.append(f"{shown}: {same} {twin.name}, left out and counted once")
+            notes.append(f"{this.shown}: {same} {twin.shown}, left out and counted once")
             continue
         seen.append(this)
-        remarks = [*picture.notes, doubtful_shape(picture.height, picture.width, has_lens=known)]
-        notes += [f"{shown}: {note}" for note in remarks if note is not None]
-        view, fitted = _fitted_view(picture, frame, config.fit, len(parts), notes)
-        parts.append(view)
-        kept.append((replace(shot, lens=lens), fitted, picture.shape))
+        notes += [f"{this.shown}: {remark}" for remark in this.remarks]
+        view_id = f"{len(parts):03d}_{safe_name(Path(this.picture.name).stem)}"
+        parts.append(view_from_fitted(this.picture, this.fitted, view_id=view_id))
+        kept.append((this.shot, this.fitted, this.picture.shape))
     _check_count(len(parts), where, config, distinct=" different", notes=notes[len(noticed) :])
     views = parts[0]
     for part in parts[1:]:
         views = views.append(part)
-    if len({this.shape for this in seen}) == 1:
+    if len({this.picture.shape for this in seen}) == 1:
         views = _without_overlay(views, notes)
     known_cameras = make_known_cameras(kept, (frame.height, frame.width), metric=metric)
     return LoadedViews(views=views, notes=_gathered(notes), known=known_cameras)
@@ -212,21 +217,73 @@ def _gathered(notes: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Seen:
-    """What is kept of a photo to recognise it again."""
+class _Read:
+    """What is left of a photo once its pixels are gone.
 
-    name: str
+    Attributes:
+        shot: where it is from, with its lens at the picture's size.
+        picture: what its file says.
+        digest: of its pixels.
+        small: to recognise it saved again.
+        first_notes: about how it was read.
+        reason: why it is left out; it has no ``fitted`` then.
+        remarks: what to say of it unless it is left out.
+        fitted: the parts of it that are kept.
+    """
+
+    shot: Shot
+    picture: PictureFacts
     digest: str
     small: Thumbnail
-    shape: tuple[int, int]
+    first_notes: tuple[str, ...]
+    reason: str | None = None
+    remarks: tuple[str, ...] = ()
+    fitted: FittedPicture | None = None
 
-    def same_picture(self, other: _Seen) -> bool:
-        aspects = (self.shape[1] / self.shape[0], other.shape[1] / other.shape[0])
+    @property
+    def shown(self) -> str:
+        """Its name, for people."""
+        return printable(self.picture.name)
+
+    def same_picture(self, other: _Read) -> bool:
+        aspects = (self.picture.width / self.picture.height, other.picture.width / other.picture.height)
         return self.digest == other.digest or is_copy(self.small, other.small, aspects=aspects)
 
 
-def _usable(shots: Sequence[Shot], config: IngestConfig, notes: list[str]) -> tuple[list[Shot], FrameSize]:
-    """The photos that a pinhole camera may have taken, by their headers, and the frame for them."""
+def _read_all(shots: Sequence[Shot], frame: FrameSize, config: IngestConfig, *, at_once: int) -> Iterator[_Read]:
+    """The photos in order, as many at the same time as torch has threads, but at most ``at_once``.
+
+    Decoders and resampling filters leave Python's lock alone, and thirty camera originals at once would not fit in memory.
+    """
+    with ThreadPoolExecutor(max_workers=min(torch.get_num_threads(), at_once, len(shots))) as pool:
+        try:
+            yield from pool.map(lambda shot: _read(shot, frame, config), shots)
+        finally:
+            pool.shutdown(cancel_futures=True)  # after the first photo that is refused no other is read
+
+
+def _read(shot: Shot, frame: FrameSize, config: IngestConfig) -> _Read:
+    notes: list[str] = []
+    picture, lens = _read_shot(shot, config, notes)
+    known = lens is not None or _knows_lens(picture.lens)
+    read = _Read(
+        shot=replace(shot, lens=lens),
+        picture=picture.facts,
+        digest=pixel_digest(picture),
+        small=thumbnail(picture.pixels),
+        first_notes=tuple(notes),
+        reason=_nothing_to_see(picture.pixels) or panorama_reason(picture.pixels, picture.xmp, has_lens=known),
+    )
+    if read.reason is not None:
+        return read
+    doubt = doubtful_shape(picture.height, picture.width, has_lens=known)
+    remarks = [*picture.notes, *([] if doubt is None else [doubt])]
+    fitted = _fitted(picture, frame, config.fit, remarks)
+    return replace(read, remarks=tuple(remarks), fitted=fitted)
+
+
+def _usable(shots: Sequence[Shot], config: IngestConfig, notes: list[str]) -> tuple[list[Shot], FrameSize, float]:
+    """The photos that a pinhole camera may have taken, by their headers, the frame for them, and the largest one's megapixels."""
     usable, sizes = [], []
     for shot in shots:
         where: str | Path = shot.picture if isinstance(shot.picture, Path) else shot.name
@@ -249,7 +306,7 @@ def _usable(shots: Sequence[Shot], config: IngestConfig, notes: list[str]) -> tu
         detail_scale=config.detail_scale,
         fit=config.fit,
     )
-    return usable, frame
+    return usable, frame, max(height * width for height, width in sizes) / 1e6
 
 
 def _nothing_to_see(pixels: Pixels) -> str | None:
@@ -268,17 +325,14 @@ def _knows_lens(lens: LensFacts) -> bool:
     return lens.focal_mm is not None or lens.focal_px is not None
 
 
-def _fitted_view(
-    picture: Picture, frame: FrameSize, fit: Fit, index: int, notes: list[str]
-) -> tuple[ViewSet, FittedPicture]:
-    shown = printable(picture.name)
+def _fitted(picture: Picture, frame: FrameSize, fit: Fit, remarks: list[str]) -> FittedPicture:
     bars = find_bars(picture.pixels)
     if bars:
-        notes.append(f"{shown}: has bars of one colour ({bars.words(*picture.shape)}), not used")
+        remarks.append(f"has bars of one colour ({bars.words(*picture.shape)}), not used")
     fitted = fit_picture(picture.pixels, frame, fit, valid=without_bars(picture, bars))
     if fitted.kept < LITTLE_KEPT:
-        notes.append(f"{shown}: only {fitted.kept:.0%} of it fits the frame of the first view")
-    return view_from_fitted(picture, fitted, view_id=f"{index:03d}_{safe_name(Path(picture.name).stem)}"), fitted
+        remarks.append(f"only {fitted.kept:.0%} of it fits the frame of the first view")
+    return fitted
 
 
 def without_bars(picture: Picture, bars: Bars) -> Mask | None:
@@ -302,9 +356,9 @@ def _without_overlay(views: ViewSet, notes: list[str]) -> ViewSet:
 
 
 def view_from_fitted(
-    picture: Picture, fitted: FittedPicture, *, view_id: str, generated: bool = False, round_number: int = 0
+    picture: PictureFacts, fitted: FittedPicture, *, view_id: str, generated: bool = False, round_number: int = 0
 ) -> ViewSet:
-    """A decoded picture and its fit to the common frame as a set of one view."""
+    """A picture and its fit to the common frame as a set of one view."""
     record = ViewRecord(
         view_id=view_id,
         name=picture.name,

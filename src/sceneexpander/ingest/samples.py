@@ -203,12 +203,18 @@ def _from_integers(values: npt.NDArray[Any], top: int | None, where: str | Path,
 
 def _from_floats(values: npt.NDArray[Any], where: str | Path, notes: list[str]) -> Pixels:
     low, high = float(values.min()), float(values.max())
+    if not np.isfinite([low, high]).all():
+        raise UserError(
+            "holds floating-point samples that are no finite numbers (NaN or infinity)",
+            where=where,
+            fix="develop it to an 8- or 16-bit picture",
+        )
     top = 1.0
     # A picture in bytes' range is bright somewhere; between 1 and 64 it would be a radiance map, which no fixed scale brings back.
     if 64 < high <= _FLOAT_BYTE_TOP + 0.5:
         top = _FLOAT_BYTE_TOP
         notes.append("its floating-point samples are taken as 0 to 255")
-    if not (low >= -0.01 * top and high <= 1.01 * top):  # also catches NaN
+    if not (low >= -0.01 * top and high <= 1.01 * top):
         raise UserError(
             f"holds floating-point samples from {low:g} to {high:g}, expected 0 to 1",
             where=where,

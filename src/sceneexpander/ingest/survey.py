@@ -23,6 +23,10 @@ _COMPANION_EXTENSIONS = frozenset(
 )  # settings and previews that belong to a photo
 
 
+class NoPicturesError(UserError):
+    """A folder holds no pictures itself; what lies below it may be more than pictures."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Survey:
     """The pictures of a folder in natural order, and what was noticed: which of its files are not among them."""
@@ -63,7 +67,7 @@ def survey_pictures(folder: Path, *, inside: Path | None = None) -> Survey:
     skipped: list[tuple[str, str]] = []
     companions = 0
     for path in list_folder(folder, expected="a folder of pictures"):
-        if _is_companion(path.name):
+        if _is_companion(path.name) or (path.name == MASKS_FOLDER and path.is_dir()):
             companions += 1
             continue
         kind = _kind(path, inside)
@@ -131,18 +135,23 @@ def _notes(count: int, skipped: list[tuple[str, str]], companions: int) -> tuple
     return (f"{count} of {total} files {verb}; {len(skipped)} skipped: {listed}{beside}",)
 
 
-def _no_pictures(folder: Path, skipped: list[tuple[str, str]]) -> UserError:
+def _no_pictures(folder: Path, skipped: list[tuple[str, str]]) -> NoPicturesError:
     counted = Counter(kind for _, kind in skipped if kind != "a folder")
     there = ", ".join(f"{kind} ({count} times)" if count > 1 else kind for kind, count in counted.most_common(4))
     found = _pictures_below(folder)
     if found:
         offered = ", ".join(f"{printable(name)}/ holds {count}" for name, count in found[:4])
-        return UserError(
+        return NoPicturesError(
             f"holds no pictures itself; {offered}",
             where=folder,
             fix="pass that folder" if len(found) == 1 else "pass one of these folders",
         )
-    return UserError(
+    videos = [name for name, kind in skipped if kind == "a video"]
+    if videos:
+        return NoPicturesError(
+            f"holds no pictures, only: {there}", where=folder, fix=f"pass {printable(videos[0])} itself"
+        )
+    return NoPicturesError(
         f"holds no pictures{f', only: {there}' if there else ''}",
         where=folder,
         fix=f"expected files named .{', .'.join(sorted(PICTURE_EXTENSIONS))}",

@@ -25,7 +25,7 @@ from sceneexpander.optimisation.checkpoint import OptimisationCheckpoint
 from sceneexpander.optimisation.config import OptimiseConfig
 from sceneexpander.optimisation.density import CloneAndSplit, DensityControl, Relocation, Seen
 from sceneexpander.optimisation.pictures import Picture, Pictures
-from sceneexpander.optimisation.splats import Splats, thinned
+from sceneexpander.optimisation.splats import Splats, thin_gaussians
 from sceneexpander.splatting import RasterSettings, rasterise, render
 
 FEWEST_VIEWS = 2  # with known cameras: one view alone says nothing about where things are
@@ -132,7 +132,9 @@ class _Run:
         self._pictures = Pictures(images, photos, start.intrinsics_px, weights, device)
         self._views = start.posed.nonzero()[:, 0].tolist()
         self._extent = scene_extent(start)
-        kept = thinned(start.gaussians, config.start_gaussians, child_generator(seed, "optimise/start")).to(device)
+        kept = thin_gaussians(start.gaussians, config.start_gaussians, child_generator(seed, "optimise/start")).to(
+            device
+        )
         kept = self._pictures.compensated(kept, start.world_from_cam.to(device))
         self.splats = Splats.of(
             kept,

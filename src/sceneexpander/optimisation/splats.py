@@ -198,7 +198,7 @@ class Splats:
                 optimiser.state[new] = kept
 
 
-def thinned(gaussians: Gaussians, limit: int, generator: torch.Generator) -> Gaussians:
+def thin_gaussians(gaussians: Gaussians, limit: int, generator: torch.Generator) -> Gaussians:
     """At most ``limit`` Gaussians, drawn evenly, each enlarged so that together they cover what all did."""
     count = len(gaussians)
     if count <= limit:

@@ -18,7 +18,7 @@ from sceneexpander.generation import Forecast, GenerationContext, check_round
 from sceneexpander.inference.config import RivalsConfig
 from sceneexpander.ingest import hold_out, load_scene
 from sceneexpander.ingest.truth import check_truth
-from sceneexpander.judge import make_judge
+from sceneexpander.judge.ask import make_judge
 from sceneexpander.models.weights import HUB_ID
 from sceneexpander.pipeline.project import GENERATED_FOLDER, JUDGED_FOLDER, find_project
 from sceneexpander.reconstruction.loaded import ModelConfig, load_model

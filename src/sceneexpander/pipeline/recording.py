@@ -11,7 +11,7 @@ from sceneexpander.artifacts.store import read_json, read_typed
 from sceneexpander.errors import UserError
 from sceneexpander.pipeline.project import ROOT_ENV
 from sceneexpander.tracking.config import TrackingConfig
-from sceneexpander.tracking.server import shown, where_runs_go
+from sceneexpander.tracking.server import hide_credentials, where_runs_go
 from sceneexpander.tracking.store import database_path
 
 RECORDED = Path("mlflow") / "tracked.json"  # what the last stage leaves
@@ -62,6 +62,6 @@ def _is_missing(scene: RecordedScene) -> bool:
         return True
     store = scene.store
     if scene.configured == "local":
-        store = shown(where_runs_go(TrackingConfig(), os.environ).uri)
+        store = hide_credentials(where_runs_go(TrackingConfig(), os.environ).uri)
     lost = store == "local" and bool(scene.runs) and not database_path(Path(os.environ.get(ROOT_ENV, "."))).is_file()
     return lost or store != scene.store

@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.store import write_json_atomic
-from sceneexpander.artifacts.views import save_png
+from sceneexpander.artifacts.views import save_png, to_bytes
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.rendering.config import RenderConfig
 from sceneexpander.rendering.tour import Tour, plan_tour
@@ -117,28 +117,46 @@ def _see_again(reconstruction: Reconstruction, see: _Eye, folder: Path) -> tuple
 def _film(
     tour: Tour, see: _Eye, config: RenderConfig, folder: Path, on_frame: Callable[[int], None] | None
 ) -> tuple[tuple[int, dict[str, str]], ...]:
-    """Render and encode frame by frame; only the depths are kept, because their colours need the range of the whole video."""
+    """Render and encode frame by frame.
+
+    Depths are kept to the end, because their colours need the range of the whole video; pictures until a path that returns has shown them
+    again.
+    """
     (folder / "stills").mkdir()
     kept = _stills(len(tour.cameras), tour.inserted_frame, config.stills)
     names = {index: {layer: f"stills/{layer}_{index:04d}.png" for layer in LAYERS} for index in kept}
     depths: list[Float[Tensor, "height width"]] = []
+    first_of = tour.cameras.find_repeats()
+    last_of = {first: index for index, first in enumerate(first_of)}
+    again: dict[int, dict[str, UInt8[Tensor, "3 height width"]]] = {}
     with contextlib.ExitStack() as videos:
         encoders = {
             layer: videos.enter_context(open_video(folder / f"{layer}.mp4", config.fps, crf=config.crf))
             for layer in LAYERS
         }
 
-        def show(layer: str, index: int, picture: Float[Tensor, "3 height width"]) -> None:
+        def show(
+            layer: str, index: int, picture: Float[Tensor, "3 height width"] | UInt8[Tensor, "3 height width"]
+        ) -> None:
             encoders[layer].add(picture)
             if index in names:
                 save_png(folder / names[index][layer], picture)
 
-        for index in range(len(tour.cameras)):
-            seen = see(tour.cameras[index])
-            rgb, alpha = seen.rgb[0].clamp(0, 1).cpu(), seen.alpha[0].cpu()
-            show("rgb", index, rgb)
-            show("provenance", index, tint_generated(rgb, seen.generated[0].cpu() * alpha))
-            depths.append(torch.where(alpha > _COVERED, seen.depth[0].cpu(), 0.0))
+        for index, first in enumerate(first_of):
+            if first < index:
+                depths.append(depths[first])
+                for layer, picture in again[first].items():
+                    show(layer, index, picture)
+            else:
+                seen = see(tour.cameras[index])
+                rgb, alpha = seen.rgb[0].clamp(0, 1).cpu(), seen.alpha[0].cpu()
+                drawn = {"rgb": rgb, "provenance": tint_generated(rgb, seen.generated[0].cpu() * alpha)}
+                depths.append(torch.where(alpha > _COVERED, seen.depth[0].cpu(), 0.0))
+                for layer, picture in drawn.items():
+                    show(layer, index, picture)
+                again[index] = {layer: to_bytes(picture) for layer, picture in drawn.items()}
+            if last_of[first] == index:
+                del again[first]
             if on_frame is not None:
                 on_frame(index + 1)
         limits = depth_range(torch.stack(depths))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -31,15 +31,15 @@ class Tour:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Cameras:
+class _Views:
     """The reconstruction's own cameras by view, the inserted one always among them."""
 
-    world_from_cam: dict[str, Float[Tensor, "4 4"]]
-    intrinsics_px: dict[str, Float[Tensor, "3 3"]]
+    names: tuple[str, ...]
+    cameras: Cameras
     goal: str  # the inserted view
 
-    def stacked(self, views: list[str]) -> tuple[Float[Tensor, "view 4 4"], Float[Tensor, "view 3 3"]]:
-        return torch.stack([self.world_from_cam[v] for v in views]), torch.stack([self.intrinsics_px[v] for v in views])
+    def at(self, *names: str) -> Cameras:
+        return self.cameras[[self.names.index(name) for name in names]]
 
 
 def plan_tour(reconstruction: Reconstruction, reference: Reconstruction, config: RenderConfig) -> Tour:
@@ -54,40 +54,38 @@ def plan_tour(reconstruction: Reconstruction, reference: Reconstruction, config:
     Raises:
         UserError: a key frame at a view that does not exist.
     """
-    cameras = _cameras(reconstruction, reference)
-    owner = reconstruction if cameras.goal in reconstruction.view_ids else reference
+    views = _views(reconstruction, reference)
+    goal = views.at(views.goal)
+    owner = reconstruction if views.goal in reconstruction.view_ids else reference
     match config.path:
         case "tour":
-            poses, intrinsics = _through_the_cameras(cameras, reconstruction, reference, config)
+            path = _through_the_cameras(views, reconstruction, reference, config)
         case "keyframes":
-            poses, intrinsics = _through_key_frames(cameras, reconstruction, reference, config)
+            path = _through_key_frames(views, reconstruction, reference, config)
         case "orbit" | "spiral":
-            poses = _around_the_inserted_view(owner, owner.view_ids.index(cameras.goal), config)
+            poses = _around_the_inserted_view(owner, owner.view_ids.index(views.goal), config)
             if owner is not reconstruction:
                 poses = same_place(poses, reference, reconstruction)
-            intrinsics = cameras.intrinsics_px[cameras.goal].expand(config.frames, 3, 3)
-    height, width = (int(side) for side in reconstruction.depth.shape[1:])
-    height_px, width_px = (_EVEN * max(1, round(side * config.scale / _EVEN)) for side in (height, width))
+            path = replace(goal[[0] * config.frames], world_from_cam=poses)
+    height_px, width_px = (_EVEN * max(1, round(side * config.scale / _EVEN)) for side in (path.height, path.width))
     return Tour(
-        cameras=Cameras(poses, intrinsics, height, width).resized(height_px, width_px),
-        inserted_frame=int((poses - cameras.world_from_cam[cameras.goal]).flatten(1).norm(dim=1).argmin()),
+        cameras=path.resized(height_px, width_px),
+        inserted_frame=int((path.world_from_cam - goal.world_from_cam).flatten(1).norm(dim=1).argmin()),
         inserted_camera=owner.method,
     )
 
 
-def _cameras(reconstruction: Reconstruction, reference: Reconstruction) -> _Cameras:
-    goal = reference.view_ids[-1]
-    poses = dict(zip(reconstruction.view_ids, reconstruction.world_from_cam, strict=True))
-    intrinsics = dict(zip(reconstruction.view_ids, reconstruction.intrinsics_px, strict=True))
-    if goal not in poses:
-        poses[goal] = same_place(reference.world_from_cam[-1:], reference, reconstruction)[0]
-        intrinsics[goal] = reference.intrinsics_px[-1]
-    return _Cameras(world_from_cam=poses, intrinsics_px=intrinsics, goal=goal)
+def _views(reconstruction: Reconstruction, reference: Reconstruction) -> _Views:
+    goal, names, cameras = reference.view_ids[-1], reconstruction.view_ids, reconstruction.cameras
+    if goal not in names:
+        pose = same_place(reference.world_from_cam[-1:], reference, reconstruction)
+        names, cameras = (*names, goal), cameras.followed_by(replace(reference.cameras[-1], world_from_cam=pose))
+    return _Views(names=names, cameras=cameras, goal=goal)
 
 
 def _through_the_cameras(
-    cameras: _Cameras, reconstruction: Reconstruction, reference: Reconstruction, config: RenderConfig
-) -> tuple[Tensor, Tensor]:
+    views: _Views, reconstruction: Reconstruction, reference: Reconstruction, config: RenderConfig
+) -> Cameras:
     # The order comes from the reference for all methods, so that their videos show the same tour.
     seen = [
         i
@@ -96,26 +94,28 @@ def _through_the_cameras(
     ]
     order = shortest_path_order(reference.world_from_cam[[*seen, -1]], last=len(seen))
     there = [reference.view_ids[seen[i]] for i in order[:-1]]
-    keys = [*there, cameras.goal, *there[::-1]]
-    return navigation(*cameras.stacked(keys), config.frames, range(len(keys)))
+    keys = views.at(*there, views.goal)
+    # The way back is the way there, to the last bit: what is drawn of a camera once is not drawn again.
+    way = navigation(keys, (config.frames + 1) // 2, range(len(keys)))
+    return way.followed_by(way[list(range(config.frames // 2))[::-1]])
 
 
 def _through_key_frames(
-    cameras: _Cameras, reconstruction: Reconstruction, reference: Reconstruction, config: RenderConfig
-) -> tuple[Tensor, Tensor]:
-    poses, intrinsics = [], []
+    views: _Views, reconstruction: Reconstruction, reference: Reconstruction, config: RenderConfig
+) -> Cameras:
+    poses, lenses = [], []
     captured = (~reference.generated).nonzero()[:, 0]
     up = mean_up(reference.world_from_cam[captured])
     for index, key in enumerate(config.keyframes):
         if isinstance(key, ViewKey):
-            if key.view not in cameras.world_from_cam:
+            if key.view not in views.names:
                 raise UserError(
                     f"key frame {index} is at view {key.view!r}, which the scene does not have",
                     where="render.keyframes",
-                    fix=f"there are {', '.join(cameras.world_from_cam)}",
+                    fix=f"there are {', '.join(views.names)}",
                 )
-            poses.append(cameras.world_from_cam[key.view])
-            intrinsics.append(cameras.intrinsics_px[key.view])
+            poses.append(views.at(key.view).world_from_cam[0])
+            lenses.append(key.view)
             continue
         eye, target = up.new_tensor(key.eye), up.new_tensor(key.target)
         ahead = torch.nn.functional.normalize(target - eye, dim=0)
@@ -125,8 +125,9 @@ def _through_key_frames(
         if reconstruction.method != reference.method:
             pose = same_place(pose[None], reference, reconstruction)[0]
         poses.append(pose)
-        intrinsics.append(cameras.intrinsics_px[cameras.goal])
-    return navigation(torch.stack(poses), torch.stack(intrinsics), config.frames, range(len(poses)))
+        lenses.append(views.goal)
+    keys = replace(views.at(*lenses), world_from_cam=torch.stack(poses))
+    return navigation(keys, config.frames, range(len(keys)))
 
 
 def _around_the_inserted_view(owner: Reconstruction, goal: int, config: RenderConfig) -> Float[Tensor, "frame 4 4"]:

@@ -12,6 +12,8 @@ from PIL import Image
 from torch import Tensor
 
 from sceneexpander.artifacts.cameras import CameraReport
+from sceneexpander.artifacts.held_out import HeldOut
+from sceneexpander.artifacts.held_out_seen import HeldOutSeen
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.judgement import FILE_NAME as JUDGEMENT
 from sceneexpander.artifacts.metrics import MetricsRow, load_row
@@ -60,8 +62,8 @@ T = TypeVar("T")
 class MethodSource:
     """Artefacts of one method in one round.
 
-    ``report``: what its reconstructor says about itself, if it has one of its own. ``refinement``: what a fit of its Gaussians to
-    their pictures changed, if there was one.
+    ``held_out``: its `HeldOutSeen`, if it was measured. ``report``: what its reconstructor says about itself, if it has one of its own.
+    ``refinement``: what a fit of its Gaussians to their pictures changed, if there was one.
     """
 
     name: str
@@ -69,6 +71,7 @@ class MethodSource:
     renders: Path
     splats: Path
     metrics: Path
+    held_out: Path | None = None
     report: Path | None = None
     refinement: Path | None = None
 
@@ -98,7 +101,7 @@ class RoundSource:
 class SceneSource:
     """Artefacts of one scene. ``report`` is what the first reconstruction said about itself, ``cameras`` its `CameraReport` if any.
 
-    ``settings``: the composed configuration, see `ScenePage`.
+    ``settings``: the composed configuration, see `ScenePage`. ``held_out``: the `HeldOut` photos.
     """
 
     scene: Path
@@ -108,6 +111,7 @@ class SceneSource:
     settings: Mapping[str, str]
     overrides: Sequence[str]
     cameras: Path | None = None
+    held_out: Path | None = None
 
 
 def collect_scene(source: SceneSource, folder: Path) -> None:
@@ -122,7 +126,8 @@ def collect_scene(source: SceneSource, folder: Path) -> None:
         settings=source.settings,
         overrides=tuple(source.overrides),
         model=read_typed(BaseModel, read_json(source.report), source.report, extra=True),
-        captured=_captured(scene.views, folder),
+        captured=_photos(scene.views, folder, "captured"),
+        held_out=_held_out(source.held_out, folder),
         cameras=gathered_cameras(source.cameras),
         statistics=_statistics(source.statistics),
         rounds=tuple(_round(item, source, folder) for item in source.rounds),
@@ -159,10 +164,17 @@ def _viewer_place(number: int) -> str:
     return f"round_{number}/viewer.html"
 
 
-def _captured(views: ViewSet, folder: Path) -> tuple[Photo, ...]:
+def _held_out(source: Path | None, folder: Path) -> tuple[Photo, ...]:
+    if source is None or not source.is_dir():
+        return ()
+    views = HeldOut.load(source).views
+    return () if views is None else _photos(views, folder, "held_out")
+
+
+def _photos(views: ViewSet, folder: Path, kind: str) -> tuple[Photo, ...]:
     photos = []
     for record, image in zip(views.records, views.detail_images, strict=True):
-        picture = f"captured/{record.view_id}.jpg"
+        picture = f"{kind}/{record.view_id}.jpg"
         _save_picture(folder / picture, image)
         photos.append(
             Photo(
@@ -333,6 +345,10 @@ def _method(source: MethodSource, folder: Path, base: str) -> MethodPage:
         view: _copy(source.renders / name, folder, f"{base}/view_{view}{Path(name).suffix}")
         for view, name in renders.views
     }
+    held_out = {}
+    if source.held_out is not None and source.held_out.is_dir():
+        for view, name in HeldOutSeen.load(source.held_out).pictures.items():
+            held_out[view] = _copy(source.held_out / name, folder, f"{base}/held_out_{view}{Path(name).suffix}")
     licence = _read_if_any(_Licence, source.report)
     return MethodPage(
         name=source.name,
@@ -349,6 +365,7 @@ def _method(source: MethodSource, folder: Path, base: str) -> MethodPage:
         videos=videos,
         stills=stills,
         view_pictures=views,
+        held_out_pictures=held_out,
         frames=renders.frames,
         fps=renders.fps,
         inserted_frame=renders.inserted_frame,

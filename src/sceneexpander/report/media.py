@@ -28,7 +28,7 @@ def poster_of(method: MethodPage) -> str:
 
 def shown_places(page: ScenePage) -> Iterator[str]:
     """Every file that the page of a scene shows: fewer than were gathered, since tracked runs have more."""
-    yield from (photo.picture for photo in page.captured)
+    yield from (photo.picture for photo in (*page.captured, *page.held_out))
     for item in page.rounds:
         yield from (item.inserted, item.viewer)
         yield from (place for place in (item.sheet, item.overlay) if place is not None)
@@ -38,7 +38,8 @@ def shown_places(page: ScenePage) -> Iterator[str]:
         for look in item.looks.looks if item.looks else ():
             yield from (place for kind, place in look.pictures.items() if kind in _LOOK_PICTURES)
         for method in item.methods:
-            yield from (*method.videos.values(), *method.view_pictures.values(), poster_of(method))
+            yield from (*method.videos.values(), *method.view_pictures.values(), *method.held_out_pictures.values())
+            yield poster_of(method)
 
 
 def copy_media(page: ScenePage, source: Path, target: Path) -> ScenePage:

@@ -109,6 +109,7 @@ def _round(page: RoundPage, scene: ScenePage, folder: Path) -> _Filled:
         "looks": looks_shown(page.looks),
         "verdict": verdict(page.judgement),
         "fits": fits(page.methods),
+        "held_out": _held_out_views(page, scene, labels, rows),
         "view_groups": _view_groups(page, scene, labels, rows),
     }
 
@@ -245,6 +246,34 @@ def _view_groups(
         ("Without a camera: at a placeholder, in no mean", [entry for entry in entries if entry["id"] in lost]),
     ]
     return [{"title": title, "views": views} for title, views in groups if views]
+
+
+def _held_out_views(
+    page: RoundPage, scene: ScenePage, labels: Mapping[str, str], rows: Mapping[str, MetricsRow]
+) -> list[_Filled]:
+    """Photos that nothing was made from, beside what each method's scene shows at the camera found for them in it."""
+    measured = {name: {view.view_id: view for view in row.held_out} for name, row in rows.items()}
+    entries = []
+    for photo in scene.held_out:
+        renders = [
+            {
+                "label": labels[method.name],
+                "picture": method.held_out_pictures.get(photo.view_id),
+                "number": _held_out_number(measured[method.name][photo.view_id]),
+            }
+            for method in page.methods
+            if photo.view_id in measured[method.name]
+        ]
+        if renders:
+            entries.append({"name": photo.name, "picture": photo.picture, "renders": renders})
+    return entries
+
+
+def _held_out_number(view: ViewMetrics) -> str:
+    if not view.posed:
+        return "no camera in its scene"
+    psnr = view.values.get("psnr_held_out_db")
+    return "" if psnr is None else f"{psnr:.2f} dB"
 
 
 def _view_number(view: ViewMetrics | None) -> str:

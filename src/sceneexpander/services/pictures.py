@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-
-import numpy as np
-from PIL import Image
+from typing import TYPE_CHECKING
 
 from sceneexpander.artifacts.store import sha256_of_bytes
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +22,10 @@ class SentPicture:
 
 def encode_picture(pixels: np.ndarray, *, long_side_px: int) -> SentPicture:
     """``pixels``, (height, width, 3) of 8-bit RGB, made smaller until no side is longer than ``long_side_px``."""
+    # Only now: settings of whoever is asked are read by stages that ask nobody.
+    import numpy as np
+    from PIL import Image
+
     picture = Image.fromarray(pixels)
     scale = min(1.0, long_side_px / max(picture.size))
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))

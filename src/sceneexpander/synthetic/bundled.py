@@ -27,10 +27,11 @@ import yaml
 from numpy.typing import NDArray
 
 from sceneexpander.files import directory_being_written
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.synthetic import courtyard
 from sceneexpander.synthetic.degrade import auto_exposure, encode_radiance
 from sceneexpander.synthetic.misalign import MisalignedView, Misalignment, misalign
-from sceneexpander.synthetic.render import RenderedViews, render_world
+from sceneexpander.synthetic.render import RenderedViews, pose_and_intrinsics, render_world
 
 Array = NDArray[Any]  # float32
 
@@ -66,15 +67,10 @@ class BundledScene:
     intrinsics_px: NDArray[np.float64]
 
 
-def unseen_by(
-    depth: Array,
-    pose: NDArray[np.float64],
-    depths: Array,
-    poses: NDArray[np.float64],
-    intrinsics: NDArray[np.float64],
-) -> NDArray[np.bool_]:
-    """(H,W): pixels of one view whose surface point lies in front of no camera in ``poses`` unhidden. Sky counts as unseen."""
+def unseen_by(depth: Array, camera: Cameras, depths: Array, others: Cameras) -> NDArray[np.bool_]:
+    """(H,W): pixels of one camera's view whose surface point is in no picture of ``others`` unhidden. Sky counts as unseen."""
     height, width = depth.shape
+    pose, intrinsics = pose_and_intrinsics(camera)
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     solid = np.isfinite(depth)
     z = np.where(solid, depth, 1.0).astype(np.float64)
@@ -83,41 +79,40 @@ def unseen_by(
     )
     points = cam @ pose[:3, :3].T + pose[:3, 3]
     seen = np.zeros(depth.shape, dtype=np.bool_)
-    for other_depth, other in zip(depths, poses, strict=True):
+    for index, other_depth in enumerate(depths):
+        other, lens = pose_and_intrinsics(others[index])
         local = (points - other[:3, 3]) @ other[:3, :3]
         ahead = np.maximum(local[..., 2], 1e-6)
-        u = local[..., 0] / ahead * intrinsics[0, 0] + intrinsics[0, 2]
-        v = local[..., 1] / ahead * intrinsics[1, 1] + intrinsics[1, 2]
-        inside = solid & (local[..., 2] > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        column, row = np.clip(u, 0, width - 1).astype(int), np.clip(v, 0, height - 1).astype(int)
+        u = local[..., 0] / ahead * lens[0, 0] + lens[0, 2]
+        v = local[..., 1] / ahead * lens[1, 1] + lens[1, 2]
+        inside = solid & (local[..., 2] > 1e-3) & (u >= 0) & (u < others.width) & (v >= 0) & (v < others.height)
+        column, row = np.clip(u, 0, others.width - 1).astype(int), np.clip(v, 0, others.height - 1).astype(int)
         seen |= inside & (ahead < other_depth[row, column] * (1 + SAME_POINT) + 0.02)
     return ~seen
 
 
 def render_bundled(height: int, width: int, *, supersample: float, ambient_samples: int) -> BundledScene:
     """Render the courtyard: eight captured views, the clean and the misaligned inserted view."""
-    intrinsics = courtyard.courtyard_intrinsics(height, width)
-    poses, inserted_pose = courtyard.captured_cameras(), courtyard.inserted_camera()
+    cameras, intended = courtyard.captured_cameras(height, width), courtyard.inserted_camera(height, width)
     options: dict[str, Any] = {
         "supersample": supersample,
         "ambient_samples": ambient_samples,
         "light_samples": 2 if ambient_samples else 1,
     }
     without, with_well = courtyard.courtyard_world(well=False), courtyard.courtyard_world(well=True)
-    many = np.broadcast_to(intrinsics, (len(poses), 3, 3))
-    captured = render_world(without, poses, many, height, width, **options)
+    captured = render_world(without, cameras, **options)
     exposure = _EXPOSURE * auto_exposure(captured.radiance)
-    clean = render_world(with_well, inserted_pose[None], intrinsics[None], height, width, **options)
+    clean = render_world(with_well, intended, **options)
     inserted = misalign(
-        with_well, inserted_pose, intrinsics, height, width, MISALIGNMENT, np.random.default_rng(_SEED),
+        with_well, intended, MISALIGNMENT, np.random.default_rng(_SEED),
         exposure=exposure, fixed=(courtyard.WELL,), together=courtyard.HOUSE_PARTS, **options,
     )  # fmt: skip
     well_id = with_well.object_names.index(courtyard.WELL)
-    first_from_world = np.linalg.inv(poses[0])
-    every = np.concatenate([poses, inserted_pose[None], inserted.world_from_used_cam[None]])
+    poses = cameras.followed_by(intended).world_from_cam.numpy()
+    every = np.concatenate([poses, inserted.world_from_used_cam[None]])
     # The new object is new even where its pixels hide something that was captured.
     object_mask = clean.object_id[0] == well_id
-    unseen = unseen_by(clean.depth[0], inserted_pose, captured.depth, poses, intrinsics)
+    unseen = unseen_by(clean.depth[0], intended, captured.depth, cameras)
     return BundledScene(
         captured=captured,
         captured_images=encode_radiance(captured.radiance, exposure),
@@ -126,8 +121,8 @@ def render_bundled(height: int, width: int, *, supersample: float, ambient_sampl
         inserted=inserted,
         new_region=unseen | object_mask,
         object_mask=object_mask,
-        world_from_cam=first_from_world @ every,
-        intrinsics_px=intrinsics,
+        world_from_cam=np.linalg.inv(poses[0]) @ every,
+        intrinsics_px=intended.intrinsics_px[0].numpy(),
     )
 
 

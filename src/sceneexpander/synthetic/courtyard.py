@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.synthetic.furniture import Colour
 from sceneexpander.synthetic.intersect import Shape
 from sceneexpander.synthetic.textures import TextureKey
-from sceneexpander.synthetic.trajectories import pose_from_angles
+from sceneexpander.synthetic.trajectories import pose_from_angles, same_lens
 from sceneexpander.synthetic.world import Light, Material, Sky, World, WorldBuilder, rotation_z
 
 WELL = "well"
@@ -398,17 +399,11 @@ def _poses(rows: tuple[tuple[float, ...], ...]) -> NDArray[np.float64]:
     return np.stack(poses)
 
 
-def captured_cameras() -> NDArray[np.float64]:
-    """(8,4,4) world-from-camera poses of the captured views."""
-    return _poses(_CAPTURED)
+def captured_cameras(height: int, width: int) -> Cameras:
+    """Of the eight captured views, in the world's frame."""
+    return same_lens(_poses(_CAPTURED), FOCAL_PER_WIDTH * width, height, width)
 
 
-def inserted_camera() -> NDArray[np.float64]:
-    """(4,4) pose from which a consistent inserted view would be taken."""
-    return _poses((_INSERTED,))[0]
-
-
-def courtyard_intrinsics(height: int, width: int) -> NDArray[np.float64]:
-    """(3,3) pixels; the same camera for all views."""
-    focal = FOCAL_PER_WIDTH * width
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+def inserted_camera(height: int, width: int) -> Cameras:
+    """The one from which a consistent inserted view would be taken."""
+    return same_lens(_poses((_INSERTED,)), FOCAL_PER_WIDTH * width, height, width)

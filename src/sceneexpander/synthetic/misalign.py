@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.synthetic.degrade import encode_radiance
 from sceneexpander.synthetic.furniture import Palette, add_chair, add_crate, add_lamp, add_plant
 from sceneexpander.synthetic.intersect import Shape
-from sceneexpander.synthetic.render import RenderedViews, render_world, trace_camera
-from sceneexpander.synthetic.world import World, WorldBuilder, merged
+from sceneexpander.synthetic.render import RenderedViews, cameras_at, pose_and_intrinsics, render_world, trace_camera
+from sceneexpander.synthetic.world import World, WorldBuilder, merge_worlds
 
 Array = NDArray[Any]  # float32
 
@@ -225,15 +226,12 @@ def hallucinated_object(
     make(builder, Palette(generator, "train", 0.3), (*place, 0.0), float(generator.uniform(0, 6.28)))
     extra = builder.build()
     names = tuple(f"hallucinated {name}" for name in extra.object_names)
-    return merged(world, replace(extra, object_names=names))
+    return merge_worlds(world, replace(extra, object_names=names))
 
 
 def misalign(
     world: World,
-    world_from_cam: NDArray[np.float64],
-    intrinsics_px: NDArray[np.float64],
-    height: int,
-    width: int,
+    camera: Cameras,
     misalignment: Misalignment,
     generator: np.random.Generator,
     *,
@@ -242,18 +240,19 @@ def misalign(
     together: tuple[str, ...] = (),
     **render_options: Any,
 ) -> MisalignedView:
-    """Render the view at ``world_from_cam`` as a generator that gets things wrong would have drawn it.
+    """Render the view of one camera as a generator that gets things wrong would have drawn it.
 
     Args:
         world: what a consistent view would show (a requested new object included).
-        world_from_cam, intrinsics_px, height, width: the true camera, in the world's frame.
+        camera: the true one, in the world's frame.
         misalignment: amounts. generator: all draws.
         exposure: that of the captured views (see `encode_radiance`).
         fixed: names of objects that never move, e.g. the requested one.
         together: names of objects that move as one.
         render_options: passed to `render_world`.
     """
-    depth = trace_camera(world, world_from_cam, intrinsics_px, height, width)[0]
+    (world_from_cam, intrinsics_px), height, width = pose_and_intrinsics(camera), camera.height, camera.width
+    depth = trace_camera(world, camera)[0]
     scene_size = float(np.median(depth[np.isfinite(depth)])) if np.isfinite(depth).any() else 1.0
     m = misalignment
     shift = m.translation_fraction * scene_size
@@ -269,7 +268,7 @@ def misalign(
     if m.hallucinate:
         bent = hallucinated_object(bent, pose, scene_size, np.random.default_rng(generator.integers(2**32)))
     used = framed_intrinsics(intrinsics_px, height, width, m, generator)
-    rendered: RenderedViews = render_world(bent, pose[None], used[None], height, width, **render_options)
+    rendered: RenderedViews = render_world(bent, cameras_at(pose, used, height, width), **render_options)
     warp = smooth_warp(height, width, m.warp_fraction * width, generator)
     gain = 2.0**m.exposure_stops
     gains = (gain * (1 + m.white_balance), gain, gain / (1 + m.white_balance))

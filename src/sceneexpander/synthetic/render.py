@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.synthetic.intersect import Array, Shape, first_hit
 from sceneexpander.synthetic.shading import Surface, shade, surface_at
 from sceneexpander.synthetic.world import World
@@ -42,10 +44,25 @@ class RenderedViews:
     primitive_id: NDArray[np.int32]
 
 
-def _screen_rectangles(
-    world: World, world_from_cam: NDArray[np.float64], intrinsics: NDArray[np.float64], height: int, width: int
-) -> NDArray[np.int64]:
+def cameras_at(
+    world_from_cam: NDArray[np.float64], intrinsics_px: NDArray[np.float64], height: int, width: int
+) -> Cameras:
+    """Cameras (double precision) of (4,4) or (V,4,4) poses and of (3,3) intrinsics that all share, or (V,3,3)."""
+    poses = np.array(world_from_cam, np.float64).reshape(-1, 4, 4)
+    lenses = np.array(np.broadcast_to(intrinsics_px, (len(poses), 3, 3)), np.float64)
+    return Cameras(torch.from_numpy(poses), torch.from_numpy(lenses), height, width)
+
+
+def pose_and_intrinsics(camera: Cameras) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """((4,4), (3,3)) of one camera, as arrays in double precision."""
+    (pose,), (intrinsics,) = (values.cpu().double().numpy() for values in (camera.world_from_cam, camera.intrinsics_px))
+    return pose, intrinsics
+
+
+def _screen_rectangles(world: World, camera: Cameras) -> NDArray[np.int64]:
     """(P,4) pixel rectangle x0, x1, y0, y1 (half open) that covers each primitive; empty where it is behind the camera."""
+    world_from_cam, intrinsics = pose_and_intrinsics(camera)
+    height, width = camera.height, camera.width
     rotation = world.rotation.astype(np.float64)
     corners = np.einsum("pij,pcj->pci", rotation, _CORNERS * world.half[:, None]) + world.centre[:, None]
     cam = (corners - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]
@@ -75,14 +92,14 @@ def _ray_grid(intrinsics: NDArray[np.float64], height: int, width: int) -> tuple
     return x, y
 
 
-def trace_camera(
-    world: World, world_from_cam: NDArray[np.float64], intrinsics: NDArray[np.float64], height: int, width: int
-) -> tuple[Array, NDArray[np.int32]]:
-    """(depth, primitive id) of every pixel centre of one pinhole camera: (H,W) each; +inf and -1 where nothing is hit."""
+def trace_camera(world: World, camera: Cameras) -> tuple[Array, NDArray[np.int32]]:
+    """(depth, primitive id) of every pixel centre of one camera: (H,W) each; +inf and -1 where nothing is hit."""
+    world_from_cam, intrinsics = pose_and_intrinsics(camera)
+    height, width = camera.height, camera.width
     depth = np.full((height, width), np.inf, dtype=np.float32)
     ids = np.full((height, width), -1, dtype=np.int32)
     ray_x, ray_y = _ray_grid(intrinsics, height, width)
-    rectangles = _screen_rectangles(world, world_from_cam, intrinsics, height, width)
+    rectangles = _screen_rectangles(world, camera)
     local_from_cam = np.einsum("pji,jk->pik", world.rotation.astype(np.float64), world_from_cam[:3, :3])
     offset = world_from_cam[:3, 3] - world.centre
     origins = np.einsum("pji,pj->pi", world.rotation.astype(np.float64), offset).astype(np.float32)
@@ -262,12 +279,19 @@ def _smooth_within_surfaces(values: Array, surface: Surface, radius: int) -> Arr
     return np.where(count > 0, total / np.maximum(count, 1), values)
 
 
+def _surface_seen(world: World, camera: Cameras) -> Surface:
+    """What every pixel centre of one camera shows."""
+    pose, intrinsics = pose_and_intrinsics(camera)
+    return surface_at(world, pose, *_ray_grid(intrinsics, camera.height, camera.width), *trace_camera(world, camera))
+
+
+def _in_tiles(side: float) -> int:
+    return max(TILE, round(side / TILE) * TILE)
+
+
 def render_world(
     world: World,
-    world_from_cam: NDArray[np.float64],
-    intrinsics_px: NDArray[np.float64],
-    height: int,
-    width: int,
+    cameras: Cameras,
     *,
     supersample: float = 1.6,
     light_samples: int = 1,
@@ -275,46 +299,39 @@ def render_world(
     ambient_reach: float = 1.5,
     seed: int = 0,
 ) -> RenderedViews:
-    """Render V views.
+    """Render a picture of each camera.
 
     Args:
         world: what to render.
-        world_from_cam: (V,4,4) camera poses in the world frame (OpenCV axes).
-        intrinsics_px: (V,3,3) in pixels of the (height, width) image.
-        height, width: image size.
+        cameras: in the world's frame.
         supersample: colour samples per pixel side (rounded so that tiles fit).
         light_samples: shadow samples per light and colour sample, for lights with a radius.
         ambient_samples: ambient-occlusion rays per pixel; 0 uses a closed form for room corners only.
         ambient_reach: distance (metres) up to which things occlude the ambient light.
         seed: of the light and occlusion samples.
     """
-    fine_h = max(TILE, round(height * supersample / TILE) * TILE)
-    fine_w = max(TILE, round(width * supersample / TILE) * TILE)
-    stretch = np.diag([fine_w / width, fine_h / height, 1.0])
+    height, width = cameras.height, cameras.width
+    cameras = cameras.double()
     out: list[tuple[Array, Array, Array, NDArray[np.int32]]] = []
-    for view, (pose, intrinsics) in enumerate(zip(world_from_cam, intrinsics_px, strict=True)):
+    for view in range(len(cameras)):
         rng = np.random.default_rng([seed, view])
-        depth, ids = trace_camera(world, pose, intrinsics, height, width)
-        exact = surface_at(world, pose, *_ray_grid(intrinsics, height, width), depth, ids)
-        normals = np.stack(exact.normals, -1) @ pose[:3, :3].astype(np.float32)
+        camera = cameras[view]
+        exact = _surface_seen(world, camera)
+        normals = np.stack(exact.normals, -1) @ pose_and_intrinsics(camera)[0][:3, :3].astype(np.float32)
         normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), np.float32(1e-9))
-        fine_k = stretch @ intrinsics
-        fine_depth, fine_ids = trace_camera(world, pose, fine_k, fine_h, fine_w)
-        surface = surface_at(world, pose, *_ray_grid(fine_k, fine_h, fine_w), fine_depth, fine_ids)
+        fine = camera.resized(_in_tiles(height * supersample), _in_tiles(width * supersample))
+        surface = _surface_seen(world, fine)
         light = direct_light(world, surface, light_samples, rng)
         open_share = None
         if ambient_samples:
             # Occlusion is smooth: one evaluation per pixel is enough, also when colour is sampled more finely.
-            even_h, even_w = (max(TILE, round(side / TILE) * TILE) for side in (height, width))
-            even_k = np.diag([even_w / width, even_h / height, 1.0]) @ intrinsics
-            even_depth, even_ids = trace_camera(world, pose, even_k, even_h, even_w)
-            even = surface_at(world, pose, *_ray_grid(even_k, even_h, even_w), even_depth, even_ids)
+            even = _surface_seen(world, camera.resized(_in_tiles(height), _in_tiles(width)))
             open_share = _open_fraction(world, even, ambient_samples, ambient_reach, rng)
-            open_share = np.asarray(cv2.resize(open_share, (fine_w, fine_h), interpolation=cv2.INTER_LINEAR))
-        radiance = shade(world, surface, light, open_share, float(fine_k[0, 0]))
+            open_share = np.asarray(cv2.resize(open_share, (fine.width, fine.height), interpolation=cv2.INTER_LINEAR))
+        radiance = shade(world, surface, light, open_share, float(fine.intrinsics_px[0, 0, 0]))
         # Clip before filtering: one very bright sample must not swallow a pixel.
         radiance = cv2.resize(np.minimum(radiance, 4), (width, height), interpolation=cv2.INTER_AREA)
-        out.append((radiance, depth, normals, ids))
+        out.append((radiance, exact.depth, normals, exact.primitive))
     primitive_id = np.stack([item[3] for item in out])
     object_id = np.where(primitive_id >= 0, world.object_id[primitive_id], -1).astype(np.int32)
     return RenderedViews(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from sceneexpander.synthetic.render import trace_rays
+from sceneexpander.geometry.cameras import Cameras
+from sceneexpander.synthetic.render import cameras_at, trace_rays
 from sceneexpander.synthetic.world import World
 
 Pose = NDArray[np.float64]
@@ -28,8 +30,7 @@ class CameraSet:
     ``disconnected`` is the index of a view that shares (almost) nothing with the others, or None.
     """
 
-    world_from_cam: NDArray[np.float64]
-    intrinsics_px: NDArray[np.float64]
+    cameras: Cameras
     motion: str
     overlap: NDArray[np.float64]
     disconnected: int | None
@@ -46,6 +47,12 @@ def pose_from_angles(eye: NDArray[np.float64], yaw: float, pitch: float, roll: f
     pose[:3, 2] = forward
     pose[:3, 3] = eye
     return pose
+
+
+def same_lens(world_from_cam: NDArray[np.float64], focal_px: float, height: int, width: int) -> Cameras:
+    """Cameras at (4,4) or (V,4,4) poses, with one focal length and the principal point in the middle; double precision."""
+    lens = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
+    return cameras_at(world_from_cam, lens, height, width)
 
 
 def _aim(eye: NDArray[np.float64], target: NDArray[np.float64], damp: float, rng: np.random.Generator) -> Pose:
@@ -97,40 +104,42 @@ def _candidates(world: World, motion: str, count: int, rng: np.random.Generator)
     return poses
 
 
-def _ray_depths(
-    world: World, poses: NDArray[np.float64], intrinsics: NDArray[np.float64], height: int, width: int
-) -> NDArray[np.float64]:
+def _grid_rays(cameras: Cameras, rows: int, columns: int) -> NDArray[np.float64]:
+    """(V,N,3) rays, 1 deep, through the middles of a grid's cells, camera frames."""
+    rays = []
+    for lens in cameras.intrinsics_px.double().numpy():
+        x = ((np.arange(columns) + 0.5) * cameras.width / columns - lens[0, 2]) / lens[0, 0]
+        y = ((np.arange(rows) + 0.5) * cameras.height / rows - lens[1, 2]) / lens[1, 1]
+        rays.append(np.stack([*np.meshgrid(x, y), np.ones((rows, columns))], -1).reshape(-1, 3))
+    return np.stack(rays)
+
+
+def _ray_depths(world: World, cameras: Cameras) -> NDArray[np.float64]:
     """(V, rows, columns) z-depth on the coarse grid, +inf for sky."""
     rows, columns = _GRID
-    x = ((np.arange(columns) + 0.5) * width / columns - intrinsics[0, 2]) / intrinsics[0, 0]
-    y = ((np.arange(rows) + 0.5) * height / rows - intrinsics[1, 2]) / intrinsics[1, 1]
-    grid = np.stack([*np.meshgrid(x, y), np.ones(_GRID)], -1).reshape(-1, 3)
-    direction = np.einsum("vij,nj->vni", poses[:, :3, :3], grid).astype(np.float32)
+    poses = cameras.world_from_cam.double().numpy()
+    direction = np.einsum("vij,vnj->vni", poses[:, :3, :3], _grid_rays(cameras, rows, columns)).astype(np.float32)
     origin = np.broadcast_to(poses[:, None, :3, 3], direction.shape).astype(np.float32)
     return (
         trace_rays(world, origin.reshape(-1, 3), direction.reshape(-1, 3)).reshape(-1, rows, columns).astype(np.float64)
     )
 
 
-def pairwise_overlap(
-    poses: NDArray[np.float64], intrinsics: NDArray[np.float64], depths: NDArray[np.float64], height: int, width: int
-) -> NDArray[np.float64]:
+def pairwise_overlap(cameras: Cameras, depths: NDArray[np.float64]) -> NDArray[np.float64]:
     """(V,V): share of view i's surface points that lie in view j's frame and are not hidden there (coarse grids)."""
     rows, columns = depths.shape[1:]
-    x = ((np.arange(columns) + 0.5) * width / columns - intrinsics[0, 2]) / intrinsics[0, 0]
-    y = ((np.arange(rows) + 0.5) * height / rows - intrinsics[1, 2]) / intrinsics[1, 1]
-    grid = np.stack([*np.meshgrid(x, y), np.ones((rows, columns))], -1).reshape(-1, 3)
+    poses, lenses = cameras.world_from_cam.double().numpy(), cameras.intrinsics_px.double().numpy()
     views = len(poses)
     flat = depths.reshape(views, -1)
     solid = np.isfinite(flat)
-    points = np.where(solid, flat, 1.0)[..., None] * grid
+    points = np.where(solid, flat, 1.0)[..., None] * _grid_rays(cameras, rows, columns)
     world_points = np.einsum("vij,vnj->vni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
     overlap = np.eye(views)
     for j in range(views):
         cam = (world_points - poses[j, :3, 3]) @ poses[j, :3, :3]
         z = np.maximum(cam[..., 2], 1e-6)
-        u = (cam[..., 0] / z * intrinsics[0, 0] + intrinsics[0, 2]) * columns / width
-        v = (cam[..., 1] / z * intrinsics[1, 1] + intrinsics[1, 2]) * rows / height
+        u = (cam[..., 0] / z * lenses[j, 0, 0] + lenses[j, 0, 2]) * columns / cameras.width
+        v = (cam[..., 1] / z * lenses[j, 1, 1] + lenses[j, 1, 2]) * rows / cameras.height
         inside = solid & (cam[..., 2] > 1e-3) & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
         column, row = np.clip(u, 0, columns - 1).astype(int), np.clip(v, 0, rows - 1).astype(int)
         seen = depths[j][row, column]
@@ -165,7 +174,6 @@ def choose_cameras(
     for attempt in range(12):
         motion = str(rng.choice(_MOTIONS, p=shares if attempt < 6 else (0.25, 0.25, 0.25, 0.1, 0.15)))
         focal = float(rng.uniform(0.55, 1.25)) * max(height, width)
-        intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
         poses = np.stack(_candidates(world, motion, max(3 * views, 10), rng))
         eyes = poses[:, :3, 3]
         inside = ((eyes >= world.bounds[0] - 1e-6) & (eyes <= world.bounds[1] + 1e-6)).all(1)
@@ -175,59 +183,51 @@ def choose_cameras(
         poses = poses[world.clearance(poses[:, :3, 3]) > MIN_CLEARANCE_M]
         if len(poses) < views:
             continue
-        depths = _ray_depths(world, poses, intrinsics, height, width)
+        cameras = same_lens(poses, focal, height, width)
+        depths = _ray_depths(world, cameras)
         flat = np.where(np.isfinite(depths), depths, 1e3).reshape(len(poses), -1)
         good = (flat.min(1) > MIN_DEPTH_M) & (np.median(flat, 1) > 0.7) & (np.isfinite(depths).mean((1, 2)) > 0.45)
-        poses, depths = poses[good], depths[good]
-        if len(poses) < views:
+        cameras, depths = cameras[torch.from_numpy(good)], depths[good]
+        if len(cameras) < views:
             continue
-        overlap = pairwise_overlap(poses, intrinsics, depths, height, width)
+        overlap = pairwise_overlap(cameras, depths)
         lonely = disconnected and views >= 3
         chosen = _greedy(overlap, views - int(lonely), rng)
         if chosen is None:
             continue
         rng.shuffle(chosen)
+        selected = cameras[chosen]
         if lonely:
-            turned = _lonely_view(world, poses[chosen], intrinsics, height, width, rng)
+            turned = _lonely_view(world, selected, rng)
             if turned is None:
                 continue
-            selected = np.concatenate([poses[chosen], turned[None]])
-        else:
-            selected = poses[chosen]
-        depths = _ray_depths(world, selected, intrinsics, height, width)
+            selected = selected.followed_by(turned)
         return CameraSet(
-            world_from_cam=selected,
-            intrinsics_px=np.broadcast_to(intrinsics, (views, 3, 3)).copy(),
+            cameras=selected,
             motion=motion,
-            overlap=pairwise_overlap(selected, intrinsics, depths, height, width),
+            overlap=pairwise_overlap(selected, _ray_depths(world, selected)),
             disconnected=views - 1 if lonely else None,
         )
     return None
 
 
-def _lonely_view(
-    world: World,
-    poses: NDArray[np.float64],
-    intrinsics: NDArray[np.float64],
-    height: int,
-    width: int,
-    rng: np.random.Generator,
-) -> Pose | None:
-    """A pose that shares less than 2 % with every given one."""
+def _lonely_view(world: World, cameras: Cameras, rng: np.random.Generator) -> Cameras | None:
+    """A camera of the same lens that shares less than 2 % with every given one."""
     for _ in range(8):
         eye = rng.uniform(world.bounds[0].astype(np.float64), world.bounds[1].astype(np.float64))
-        away = poses[0, :3, 2]
+        away = cameras.world_from_cam[0, :3, 2].numpy()
         yaw = float(np.arctan2(-away[1], -away[0]) + rng.normal(0, 0.5))
         pose = pose_from_angles(eye, yaw, float(rng.normal(0, 0.05)), 0.0)
-        together = np.concatenate([poses, pose[None]])
-        depths = _ray_depths(world, together, intrinsics, height, width)
+        camera = replace(cameras[0], world_from_cam=torch.from_numpy(pose)[None])
+        together = cameras.followed_by(camera)
+        depths = _ray_depths(world, together)
         if (
             world.clearance(eye[None])[0] < MIN_CLEARANCE_M
             or depths[-1].min() < MIN_DEPTH_M
             or np.isinf(depths[-1]).mean() > 0.5
         ):
             continue
-        overlap = pairwise_overlap(together, intrinsics, depths, height, width)
+        overlap = pairwise_overlap(together, depths)
         if max(overlap[-1, :-1].max(), overlap[:-1, -1].max()) < 0.02:
-            return pose
+            return camera
     return None

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.synthetic.degrade import auto_exposure, encode_radiance
 from sceneexpander.synthetic.degrade import degrade as degrade_images
@@ -49,6 +50,12 @@ class SyntheticViews:
     seed: int
     split: Split = "train"
     disconnected: int | None = None
+
+    @property
+    def cameras(self) -> Cameras:
+        """Of all views."""
+        height, width = self.images.shape[-2:]
+        return Cameras(self.world_from_cam, self.intrinsics_px, height, width)
 
 
 def _stream(seed: int, split: str, purpose: str, attempt: int = 0) -> np.random.Generator:
@@ -95,14 +102,12 @@ def make_views(
     Raises:
         ValueError: unknown kind, or no set of that many overlapping views in 50 worlds.
     """
-    world, cameras = make_scene(seed, views=views, height=height, width=width, kind=kind, split=split)
-    rendered = render_world(
-        world, cameras.world_from_cam, cameras.intrinsics_px, height, width, supersample=supersample, seed=seed
-    )
+    world, chosen = make_scene(seed, views=views, height=height, width=width, kind=kind, split=split)
+    rendered = render_world(world, chosen.cameras, supersample=supersample, seed=seed)
     images = encode_radiance(rendered.radiance, auto_exposure(rendered.radiance)).transpose(0, 3, 1, 2)
     if degrade:
         images = degrade_images(images, _stream(seed, split, "degrade"))
-    world_from_cam = torch.from_numpy(cameras.world_from_cam)
+    world_from_cam = chosen.cameras.world_from_cam
     relative = rigid_inverse(world_from_cam[:1]) @ world_from_cam
     relative[0] = torch.eye(4, dtype=relative.dtype)
     depth = torch.from_numpy(rendered.depth)
@@ -112,10 +117,10 @@ def make_views(
         valid=torch.isfinite(depth),
         normals=torch.from_numpy(rendered.normals),
         world_from_cam=relative.float(),
-        intrinsics_px=torch.from_numpy(cameras.intrinsics_px).float(),
+        intrinsics_px=chosen.cameras.intrinsics_px.float(),
         object_id=torch.from_numpy(rendered.object_id.astype(np.int64)),
         kind=world.kind,
         seed=seed,
         split=split,
-        disconnected=cameras.disconnected,
+        disconnected=chosen.disconnected,
     )

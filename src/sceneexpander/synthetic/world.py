@@ -133,7 +133,7 @@ class World:
         return best
 
 
-def merged(world: World, other: World) -> World:
+def merge_worlds(world: World, other: World) -> World:
     """``world`` with the primitives and materials of ``other`` added; lights, sky and bounds are those of ``world``."""
     joined: dict[str, object] = {}
     for name in ("shape", "centre", "rotation", "half", "extra", "casts_shadow"):

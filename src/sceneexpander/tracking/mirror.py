@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from sceneexpander.artifacts.cameras import CameraReport
@@ -72,7 +72,7 @@ def _run(
         metrics=tracked_row(row) | tracked_cost({stage.partition("-")[0]: run for stage, run in stages.items()}),
         curves=_curves(item) if adapted else {},
         artefacts=_artefacts(item, method, folder, extra) | (_look_pictures(item, folder) if adapted else {}),
-        pictures=_compared_pictures(item, method, folder, adapted=adapted),
+        pictures=_compared_pictures(item, method, _held_out_pairs(page, method), folder, adapted=adapted),
         tags={
             "scene": scene,
             "round": str(number),
@@ -119,15 +119,30 @@ def _look_pictures(item: RoundPage, folder: Path) -> dict[str, Path]:
     return {f"looks/{Path(path).name}": folder / path for look in looks for path in look.pictures.values()}
 
 
+def _held_out_pairs(page: ScenePage, method: MethodPage) -> dict[str, str]:
+    """Held-out photos and what the method's scene shows from there, by what each is called beside the other."""
+    photos = {photo.view_id: photo.picture for photo in page.held_out}
+    found = {}
+    for view, picture in method.held_out_pictures.items():
+        found[f"held-out {view}"] = picture
+        if view in photos:
+            found[f"held-out {view}, photo"] = photos[view]
+    return found
+
+
 def _compared_pictures(
-    item: RoundPage, method: MethodPage, folder: Path, *, adapted: bool
+    item: RoundPage, method: MethodPage, held_out: Mapping[str, str], folder: Path, *, adapted: bool
 ) -> dict[str, list[tuple[int, Path]]]:
-    """What to look at side by side: the still nearest to the inserted view, some views at their own cameras, the looks of an adaptation."""
+    """What to look at side by side.
+
+    The still nearest to the inserted view, held-out photos, some views at their own cameras, the looks of an adaptation.
+    """
     still = min(method.stills, key=lambda still: abs(still.frame - method.inserted_frame))
     shown = [view.view_id for view in method.views if view.view_id in method.view_pictures]
     looks = item.looks.looks if adapted and item.looks else ()
     found = {
         "near the inserted view": [(0, still.pictures["rgb"])],
+        **{name: [(0, place)] for name, place in held_out.items()},
         **{
             view: [(0, method.view_pictures[view])]
             for place, view in enumerate(shown)
@@ -174,7 +189,7 @@ def _artefacts(item: RoundPage, method: MethodPage, folder: Path, extra: Sequenc
     places = {"inserted": [item.inserted, *(place for place in (item.sheet, item.overlay) if place)]}
     places["videos"] = list(method.videos.values())
     places["stills"] = [path for still in method.stills for path in still.pictures.values()]
-    places["views"] = list(method.view_pictures.values())
+    places["views"] = [*method.view_pictures.values(), *method.held_out_pictures.values()]
     found = {f"{kind}/{Path(path).name}": folder / path for kind, paths in places.items() for path in paths}
     found["metrics.json"] = folder / method.metrics
     if item.problems:

@@ -33,7 +33,7 @@ def where_runs_go(config: TrackingConfig, environment: Mapping[str, str]) -> Tra
     return replace(config, uri=named)
 
 
-def shown(uri: str) -> str:
+def hide_credentials(uri: str) -> str:
     """An address without the name and the password in it."""
     parts = urllib.parse.urlsplit(uri)
     return urllib.parse.urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2])) if parts.netloc else uri
@@ -49,7 +49,8 @@ def require_server(config: TrackingConfig) -> None:
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE  # the client decides whom it trusts
     try:
-        with urllib.request.urlopen(f"{shown(config.uri).rstrip('/')}/health", timeout=_PATIENCE_S, context=context):  # noqa: S310
+        health = f"{hide_credentials(config.uri).rstrip('/')}/health"
+        with urllib.request.urlopen(health, timeout=_PATIENCE_S, context=context):  # noqa: S310
             return
     except urllib.error.HTTPError as error:
         if error.code not in _NOBODY:
@@ -61,4 +62,4 @@ def require_server(config: TrackingConfig) -> None:
     except (OSError, ValueError, http.client.HTTPException) as error:
         problem = str(error) or type(error).__name__
     fix = f"start it, or take tracking=none; the address is that of the settings, or of {SHELL_URI}"
-    raise UserError(f"does not answer ({problem})", where=f"tracking.uri {shown(config.uri)}", fix=fix)
+    raise UserError(f"does not answer ({problem})", where=f"tracking.uri {hide_credentials(config.uri)}", fix=fix)

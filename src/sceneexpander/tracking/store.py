@@ -18,7 +18,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.tracking.config import TrackingConfig
 from sceneexpander.tracking.describe import describe_experiment
 from sceneexpander.tracking.record import RunRecord
-from sceneexpander.tracking.server import SHELL_URI, shown
+from sceneexpander.tracking.server import SHELL_URI, hide_credentials
 
 _log = logging.getLogger(__name__)
 
@@ -163,7 +163,7 @@ def record_runs(
         if sweep is not None:
             for record in records:
                 _set_tag(client, experiment, record.key, known[record.key], f"sweep.{sweep}")
-    _log.info("recorded %d of %d runs (%s)", len(missing), len(records), shown(config.uri))
+    _log.info("recorded %d of %d runs (%s)", len(missing), len(records), hide_credentials(config.uri))
     return len(missing), len(records) - len(missing)
 
 
@@ -204,7 +204,9 @@ def open_store(config: TrackingConfig, root: Path) -> tuple[Any, str]:
                 # Others may be writing the first tables just now, e.g. an `mlflow ui` that nobody can ask to wait.
                 first = str(error).strip().partition("\n")[0] or type(error).__name__
                 if attempt == _ATTEMPTS - 1 or not any(text in str(error) for text in _BUSY):
-                    raise UserError(f"cannot be used ({first})", where=f"tracking.uri {shown(config.uri)}") from None
+                    raise UserError(
+                        f"cannot be used ({first})", where=f"tracking.uri {hide_credentials(config.uri)}"
+                    ) from None
                 time.sleep(0.1 * 2**attempt)
     raise AssertionError("the last attempt returns or raises")
 

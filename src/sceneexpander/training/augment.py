@@ -21,11 +21,11 @@ def augment(sample: Sample, generator: torch.Generator) -> Sample:
         order = order[:-1]
     sample = sample.select_inputs(order)
     if chance[1] < 0.5:
-        sample = mirrored(sample)
+        sample = mirror_sample(sample)
     return replace(sample, images=jitter_colours(sample.images, generator, apart=chance[2] < 0.3))
 
 
-def mirrored(sample: Sample) -> Sample:
+def mirror_sample(sample: Sample) -> Sample:
     """The sample as seen in a vertical mirror: x becomes -x in pictures, cameras and normals."""
     width = sample.images.shape[-1]
     flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0]))

@@ -12,6 +12,7 @@ from sceneexpander.frontend.dense import DenseConfig, dense_depth
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm_types import LearnedUse, SfmConfig
 from sceneexpander.frontend.sparse_points import SparsePoints
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.synthetic.textures import Split
@@ -128,6 +129,7 @@ def sample_of_scene(
         posed[inputs - 1] = inputs == 1
     pick = torch.tensor(input_order(scene, inputs))
     images, depth, valid = scene.images[pick], scene.depth[pick], scene.valid[pick]
+    height, width = images.shape[-2:]
     intrinsics = scene.intrinsics_px[pick]
     truth = scene.world_from_cam[pick]
     truth = rigid_inverse(truth[:1]) @ truth
@@ -136,8 +138,7 @@ def sample_of_scene(
         images[kept][posed],
         depth[kept][posed],
         valid[kept][posed],
-        truth[kept][posed],
-        intrinsics[kept][posed],
+        Cameras(truth, intrinsics, height, width)[kept][posed],
         generator,
         per_view=conditions.points_per_view,
         depth_noise=conditions.point_noise,
@@ -154,7 +155,8 @@ def sample_of_scene(
         points_world=points, view_index=sparse.view_index, point_index=sparse.point_index, pixel_xy=sparse.pixel_xy
     )
     settings = DenseConfig(threads=1) if dense is None else dense
-    base = dense_depth(images[kept], prior_poses, prior_intrinsics, sparse, settings, posed=posed)
+    prior_cameras = Cameras(prior_poses, prior_intrinsics, height, width)
+    base = dense_depth(images[kept], prior_cameras, sparse, settings, posed=posed)
     log_base = base.depth.log()
     gap = base.evidence[:, EVIDENCE_CHANNELS.index("sparse")]
     return Sample(

@@ -1,4 +1,4 @@
-"""How good a prediction is on a sample, beside the base and trivial baselines. One depth scale per scene, as in the bars."""
+"""How good a prediction is on a sample, beside the base and trivial baselines. One depth scale per scene."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sceneexpander.frontend.sparse_points import SparsePoints
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rigid_from_parts, rotation_from_quat_wxyz, transform_points
 
 
@@ -18,8 +19,7 @@ def sample_sparse_points(
     images: Float[Tensor, "view 3 height width"],
     depth: Float[Tensor, "view height width"],
     valid: Bool[Tensor, "view height width"],
-    world_from_cam: Float[Tensor, "view 4 4"],
-    intrinsics_px: Float[Tensor, "view 3 3"],
+    cameras: Cameras,
     generator: torch.Generator,
     *,
     per_view: tuple[int, int] = (50, 150),
@@ -35,9 +35,11 @@ def sample_sparse_points(
 
     Args:
         valid: where ``depth`` is known; nothing is drawn elsewhere.
+        cameras: those of ``images``.
         per_view: least and greatest number of points drawn from one view (uniform, one number for the scene).
     """
-    views, width = images.shape[0], images.shape[3]
+    views, width = len(cameras), cameras.width
+    world_from_cam, intrinsics_px = cameras.world_from_cam, cameras.intrinsics_px
     count = int(torch.randint(per_view[0], per_view[1] + 1, (), generator=generator))
     chance = _gradient(images) * valid.float()
     points, view_index, point_index, pixels = [], [], [], []

@@ -19,7 +19,7 @@ from sceneexpander.geometry.similarity import Similarity
 from sceneexpander.viewer.cameras import ShownCameras, alignment, frustum_length, up_direction
 from sceneexpander.viewer.gate import check_authority, gate
 from sceneexpander.viewer.packed import visible_weight
-from sceneexpander.viewer.viser_axes import enlargement, viser_camera, viser_picture, viser_splats, widened
+from sceneexpander.viewer.viser_axes import enlargement, viser_camera, viser_picture, viser_splats, widen_gaussians
 
 HOST = "127.0.0.1"  # never another: the server has no accounts
 CAPTURED_COLOUR = (98, 188, 195)
@@ -45,7 +45,7 @@ class LiveMethod:
         if len(gaussians) > limit:
             weight = visible_weight(reconstruction)
             gaussians = gaussians.select(torch.argsort(weight, descending=True, stable=True)[:limit])
-        gaussians = widened(gaussians, cameras)
+        gaussians = widen_gaussians(gaussians, cameras)
         transform = alignment(cameras, main).enlarged(factor)
         return cls(
             name=reconstruction.method,

@@ -59,7 +59,7 @@ def enlargement(gaussians: Gaussians) -> float:
     return TYPICAL_STD / max(float(gaussians.scales.median()), torch.finfo(torch.float32).tiny)
 
 
-def widened(gaussians: Gaussians, cameras: ShownCameras) -> Gaussians:
+def widen_gaussians(gaussians: Gaussians, cameras: ShownCameras) -> Gaussians:
     """Gaussians wide enough for viser to draw them where a window has about the resolution of the views.
 
     It leaves out those of which opacity times the determinant of the 2-D covariance (blurred by 0.3) is below a quarter of a pixel^4; a

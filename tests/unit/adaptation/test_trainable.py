@@ -118,14 +118,14 @@ def test_the_plateau_compares_windows(anchors: list[float], stops: bool) -> None
     config = AdaptConfig(plateau=PlateauConfig(window=2, tolerance=0.1), lambda_gen=0.0)
     # The number of views changes from step to step and must not matter.
     records = [_record(i + 1, value, None, captured=2 + i % 3) for i, value in enumerate(anchors)]
-    assert plateau.reached(records, config) == stops
+    assert plateau.has_plateaued(records, config) == stops
 
 
 def test_the_plateau_waits_until_the_inserted_view_was_seen() -> None:
     config = AdaptConfig(plateau=PlateauConfig(window=1), lambda_gen=1.0)
-    assert not plateau.reached([_record(1, 1.0, 1.0), _record(2, 1.0, None)], config)
-    assert plateau.reached([_record(1, 1.0, 1.0), _record(2, 1.0, 1.0)], config)
-    assert not plateau.reached([_record(1, 1.0, 1.0), _record(2, 1.0, 0.5)], config)
+    assert not plateau.has_plateaued([_record(1, 1.0, 1.0), _record(2, 1.0, None)], config)
+    assert plateau.has_plateaued([_record(1, 1.0, 1.0), _record(2, 1.0, 1.0)], config)
+    assert not plateau.has_plateaued([_record(1, 1.0, 1.0), _record(2, 1.0, 0.5)], config)
 
 
 @pytest.mark.parametrize("insertion", [0.0, 0.5])

@@ -20,6 +20,7 @@ from safetensors.torch import load_file, save_file
 from sceneexpander.adaptation.checkpoint import Checkpoint as AdaptationCheckpoint
 from sceneexpander.artifacts.anchors import Anchors
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
+from sceneexpander.artifacts.held_out_seen import HeldOutSeen
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.metrics import MetricsRow, UnavailableRow, ViewMetrics, load_row
 from sceneexpander.artifacts.page import (
@@ -113,7 +114,7 @@ def save_page(folder: Path) -> None:
         name="backbone", model="mini", weights_sha256="a", licence=None, refinement=Refinement(steps=3, before=0.2, after=0.1),
         views=(ShownView(view_id="v", generated=False, posed=True),), videos={"rgb": "rgb.mp4"},
         stills=(Still(frame=0, pictures={"rgb": "s.png"}),), view_pictures={"v": "v.png"}, frames=2, fps=24, inserted_frame=1,
-        inserted_camera="own", width=6, height=4, gaussians=3, metrics="m.json", map="<svg/>",
+        inserted_camera="own", width=6, height=4, gaussians=3, metrics="m.json", map="<svg/>", held_out_pictures={"h": "h.png"},
     )  # fmt: skip
     look = LookPage(step=0, values={"captured_psnr": 20.0}, drift={"a": 0.1}, pictures={"depth": "d.jpg"})
     one = RoundPage(
@@ -131,11 +132,16 @@ def save_page(folder: Path) -> None:
         scene="room", settings={"seed": "0"}, overrides=("seed=0",),
         model=BaseModel(model="mini", weights_sha256="a", licence="free"),
         captured=(Photo(view_id="v", name="a.jpg", picture="a.jpg", original=(6, 4), sha256="a"),), cameras=None,
-        statistics={}, rounds=(one,),
+        statistics={}, rounds=(one,), held_out=(Photo(view_id="h", name="h.jpg", picture="h.jpg", original=(6, 4), sha256="b"),),
     ).save(folder)  # fmt: skip
     # The tests below change the file of this name.
     (folder / "page.json").rename(folder / FACTS_NAME)
     (folder / "page.json").symlink_to(FACTS_NAME)
+
+
+def save_seen(folder: Path) -> None:
+    (folder / "h.png").write_bytes(b"png")
+    HeldOutSeen(pictures={"h": "h.png"}).save(folder)
 
 
 def save_row(row: MetricsRow | UnavailableRow) -> Callable[[Path], None]:
@@ -162,6 +168,7 @@ KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
         WeightsChange.load,
     ),
     "renders": (save_renders, Renders.load),
+    "held out, seen": (save_seen, HeldOutSeen.load),
     "packed": (lambda folder: pack_splats(made_reconstruction()).save(folder), PackedSplats.load),
     "unavailable": (lambda folder: Unavailable(method="m", model="m", reason="r").save(folder), Unavailable.load),
     "reconstruction": (lambda folder: make_reconstruction().save(folder), Reconstruction.load),

@@ -18,6 +18,7 @@ from unlike_photos import CASES, Photo, Place, place_of
 from sceneexpander.errors import UserError
 from sceneexpander.ingest import IngestConfig, read_views
 from sceneexpander.synthetic import encode_radiance, render_world
+from sceneexpander.synthetic.render import cameras_at
 
 BENT = {"barrel": (-0.22, 0.05), "pincushion": (0.12, 0.0), "mild_barrel": (-0.06, 0.0)}
 CAMERALESS = {"noise", "black", "textureless", "watermark_alone"}
@@ -39,9 +40,8 @@ def rendered(place: Place, photo: Photo) -> np.ndarray:
     """What the photo's camera sees."""
     height, width = photo.pixels.shape[:2]
     assert photo.world_from_cam is not None
-    picture = render_world(
-        place.world, photo.world_from_cam[None], photo.intrinsics[None], height, width, supersample=1.0
-    )
+    camera = cameras_at(photo.world_from_cam, photo.intrinsics, height, width)
+    picture = render_world(place.world, camera, supersample=1.0)
     return encode_radiance(picture.radiance[0], place.exposure) * 255
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander.adaptation.loop import StepRecord
 from sceneexpander.adaptation.observe import Look
+from sceneexpander.adaptation.records import StepRecord
 from sceneexpander.catalogue import (
     GROUP_MEANINGS,
     LOOKS,

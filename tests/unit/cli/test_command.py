@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -120,25 +121,22 @@ def test_bash_completes_commands_and_options(tmp_path: Path, words: list[str], e
 
 @pytest.mark.parametrize(
     "module",
-    [
-        "ablation",
-        "benchmark",
-        "conformance",
-        "convert_checkpoint",
-        "expand",
-        "follow",
-        "judge_run",
-        "plan",
-        "study",
-        "sweep",
-        "ui",
-        "viewer",
-    ],
+    [command.module for command in COMMANDS if command.name not in ("run", "check", "completion")],
 )
 def test_the_module_of_a_command_can_be_run_as_well(module: str) -> None:
-    path = ROOT / "src" / "sceneexpander" / module
-    path = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
-    assert 'if __name__ == "__main__":\n' in path.read_text(encoding="utf-8")
+    found, short = find_spec(module), find_spec(module.replace(".cli.", "."))
+    assert found is not None
+    assert short is not None
+    assert found.origin is not None
+    assert short.origin == found.origin
+    assert 'if __name__ == "__main__":\n' in Path(found.origin).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("program", ["sceneexpander", "sceneexpander.plan"])
+def test_without_the_script_python_finds_the_commands(program: str) -> None:
+    line = [sys.executable, "-m", program, "--help"]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("usage: sceneexpander ")
 
 
 def test_check_looks_at_the_project_from_any_folder_of_it(

@@ -48,7 +48,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Any:
         yield value
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(text=TEXTS.filter(lambda text: text != "???"))
 def test_any_text_comes_back_as_it_was(plain: Any, text: str) -> None:
     from hydra.core.override_parser.overrides_parser import OverridesParser

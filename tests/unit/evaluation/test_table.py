@@ -92,22 +92,29 @@ def test_repeats_become_a_mean_with_its_spread() -> None:
         over_repeats([runs[0], row("b", "gaussian_splatting", 1.0)])
 
 
-def test_gaps_are_shown_not_averaged_over() -> None:
+def test_the_means_of_a_column_are_over_the_same_cells() -> None:
+    """Captured has an easy scene more than SceneExpander: that must not raise its mean."""
     rows = [
         row("a", "captured", 25.0, tour_covered=0.5),
-        row("b", "captured", 15.0),
+        row("b", "captured", 40.0, tour_covered=0.6),
         row("a", "sceneexpander", 20.0, tour_covered=0.9, depth_abs_rel=0.1),
-        row("c", "backbone", 18.0, tour_covered=0.9),
+        row("c", "sceneexpander", 22.0, tour_covered=0.7, depth_abs_rel=0.3),
     ]
     header, *lines = cells(comparison_table(rows).csv())
     table = {line[0].split()[0]: dict(zip(header, line, strict=True)) for line in lines}
-    assert table["Captured"]["PSNR, stored size, dB ↑"] == "20.00 (2/3)"
-    assert table["Captured"]["Tour covered, % ↑"] == "50.0 (1/3)"
-    assert table["Captured"]["Depth error, % ↓"] == "missing"
-    assert table["SceneExpander"]["cells of 3"] == "1"
-    assert table["SceneExpander"]["Depth error, % ↓"] == "10.00 (1/3)"
-    assert table["made"]["Tour covered, gained, % ↑"] == "missing"  # nothing to compare with in scene c
+    assert table["Captured"]["PSNR, stored size, dB ↑"] == "25.00 (1/3)"
+    assert table["SceneExpander"]["PSNR, stored size, dB ↑"] == "20.00 (1/3)"
+    assert table["SceneExpander"]["Tour covered, gained, % ↑"] == "40.0 (1/3)"
+    assert table["Captured"]["Depth error, % ↓"] == "missing", "what a method never has narrows no column"
+    assert table["SceneExpander"]["Depth error, % ↓"] == "20.00 (2/3)"
+    assert table["SceneExpander"]["cells of 3"] == "2"
     assert "Inserted PSNR, stored size, dB ↑" not in header
+
+
+def test_methods_without_a_cell_in_common_have_no_means() -> None:
+    rows = [row("a", "captured", 25.0), row("b", "backbone", 15.0), row("b", "sceneexpander", 16.0)]
+    _, *lines = cells(comparison_table(rows).csv())
+    assert [line[3] for line in lines] == ["no common cell"] * 3
 
 
 def test_scene_table_lists_absent_combinations() -> None:

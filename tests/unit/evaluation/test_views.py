@@ -118,6 +118,22 @@ def test_one_view_has_no_others() -> None:
     assert not {"psnr_from_others_db", "covered_by_others"} & set(row.values)
 
 
+def test_a_picture_that_shows_nothing_of_the_place_has_no_numbers_and_no_mean_is_over_the_others(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    scene = made_reconstruction()
+    views = own_pictures(scene)
+    valid = torch.ones(len(views), HEIGHT, WIDTH, dtype=torch.bool)
+    valid[1] = False
+    config = EvaluateConfig(st_lpips=False, flip=False)
+    masked = dataclasses.replace(views, valid=valid)
+    row = evaluate(scene, masked, config, scene="s", round_number=1, seed=0)
+    assert [bool(view.values) for view in row.views] == [True, False, True]
+    assert "psnr_captured_db" not in row.values
+    assert row.values["psnr_worst_earlier_db"] == row.views[0].values["psnr_captured_db"]
+    assert "too little of the picture shows the place" in caplog.text
+
+
 def test_coverage_gained_by_the_expansion() -> None:
     scene = made_reconstruction()
     before = without_generated(scene)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander import ablation
+from sceneexpander.cli import ablation
 from sceneexpander.expandbench.document import READING, Results, written
 from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult, Plan, Settings
 from sceneexpander.expandbench.studies import STUDIES
@@ -64,15 +64,15 @@ def test_all_studies_make_one_file_and_one_page(project: Path, monkeypatch: pyte
 
 
 def test_one_study_leaves_the_others_as_they_were_measured(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    command(monkeypatch, ["--study", "rows,predicted"])
+    command(monkeypatch, ["--study", "grades,free_cameras"])
     before = Results.load(project / "results" / "ablation.json")
-    command(monkeypatch, ["--study", "predicted", "refine.visits=3"])
+    command(monkeypatch, ["--study", "free_cameras", "refine.visits=3"])
     after = Results.load(project / "results" / "ablation.json")
-    assert after.studies["rows"] == before.studies["rows"]
-    assert after.studies["predicted"].visits == 3
+    assert after.studies["grades"] == before.studies["grades"]
+    assert after.studies["free_cameras"].visits == 3
     monkeypatch.setattr(ablation, "version", lambda _: "9.9.9")
-    command(monkeypatch, ["--study", "predicted"])
-    assert list(Results.load(project / "results" / "ablation.json").studies) == ["predicted"], (
+    command(monkeypatch, ["--study", "free_cameras"])
+    assert list(Results.load(project / "results" / "ablation.json").studies) == ["free_cameras"], (
         "another version's are gone"
     )
 

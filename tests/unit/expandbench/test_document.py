@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander.ablation import make_plan
 from sceneexpander.adaptation.config import AdaptConfig
+from sceneexpander.cli.ablation import make_plan
 from sceneexpander.errors import UserError
 from sceneexpander.expandbench.document import READING, Measured, Results, document, powerless, written
 from sceneexpander.expandbench.grades import GRADES

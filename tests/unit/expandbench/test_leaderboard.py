@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from sceneexpander import benchmark
+from sceneexpander.cli import benchmark
 from sceneexpander.errors import UserError
 from sceneexpander.expandbench import leaderboard
 from sceneexpander.expandbench.dataset import CAPTURED_VIEWS, INTENDED, Seen, TrueScene, generate, load_truth

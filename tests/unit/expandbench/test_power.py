@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from sceneexpander.adaptation.config import AdaptConfig, PlateauConfig
-from sceneexpander.expandbench.power import touched, without_power
+from sceneexpander.expandbench.power import share_restored, without_power
 from sceneexpander.insertion.contradiction import Contradiction
 from tests.support.methods import make_method
 
@@ -51,6 +51,6 @@ def test_a_row_with_other_steps_is_another_row() -> None:
 
 
 def test_the_share_is_that_of_independent_draws() -> None:
-    assert touched(LONG) == pytest.approx(1 - 0.999**40)
-    assert touched(replace(LONG, restore_interval=0)) == 0
-    assert touched(replace(SHORT, restore_interval=40)) == 0
+    assert share_restored(LONG) == pytest.approx(1 - 0.999**40)
+    assert share_restored(replace(LONG, restore_interval=0)) == 0
+    assert share_restored(replace(SHORT, restore_interval=40)) == 0

@@ -13,11 +13,11 @@ from sceneexpander.expandbench.run import BASELINE, CAPTURED, CellResult
 from sceneexpander.expandbench.table import (
     COLUMNS,
     acceptance_table,
+    compare_rows,
     components_table,
     curve_table,
     main_table,
     mean_of,
-    paired,
     row_names,
     scenes_table,
     seed_spread,
@@ -63,18 +63,18 @@ def test_a_mean_with_a_gap_is_no_mean() -> None:
 
 
 def test_differences_are_paired_by_scene_and_grade() -> None:
-    found = paired(CELLS, "paper", PSNR)
+    found = compare_rows(CELLS, "paper", PSNR)
     assert found is not None
     # Scene a: 21 - 20 and 22 - 20.4, scene b: 21.9 - 22 and 21.9 - 22.4: each with the baseline of its own seed.
     assert found.mean == pytest.approx((1.3 - 0.3) / 2)
     assert found.lowest == pytest.approx(-0.3)
     assert (found.better, found.scenes) == (1, 2)
     assert found.seed_spread == pytest.approx(abs((1 - 0.1) / 2 - (1.6 - 0.5) / 2) / 2**0.5)
-    assert paired([c for c in CELLS if c.row != BASELINE or c.seed == 0], "paper", PSNR) == paired(
+    assert compare_rows([c for c in CELLS if c.row != BASELINE or c.seed == 0], "paper", PSNR) == compare_rows(
         CELLS[:6], "paper", PSNR
     )
-    assert paired(CELLS[:4], "paper", PSNR) is None
-    assert paired([c for c in CELLS if c.row != BASELINE], "paper", PSNR) is None
+    assert compare_rows(CELLS[:4], "paper", PSNR) is None
+    assert compare_rows([c for c in CELLS if c.row != BASELINE], "paper", PSNR) is None
 
 
 def test_a_component_is_compared_with_the_row_that_lacks_it_unless_it_cannot_show() -> None:
@@ -104,13 +104,13 @@ def test_scene_by_scene() -> None:
 
 
 def test_for_errors_lower_is_better_and_higher_is_worst() -> None:
-    found = paired(CELLS, "paper", DEPTH)
+    found = compare_rows(CELLS, "paper", DEPTH)
     assert found is not None
     assert found.mean == pytest.approx(0.0)
     assert found.lowest == pytest.approx(0.01)
     assert found.better == 1
     smaller = [replace(c, numbers=changed(c.numbers, depth_abs_rel=0.03)) if c.row == "paper" else c for c in CELLS]
-    found = paired(smaller, "paper", DEPTH)
+    found = compare_rows(smaller, "paper", DEPTH)
     assert found is not None
     assert (found.better, found.scenes) == (2, 2)
 

@@ -14,8 +14,8 @@ from PIL import Image
 
 from sceneexpander.artifacts.scene import KnownCameras
 from sceneexpander.artifacts.source_type import read_source_type
+from sceneexpander.cli.export import main
 from sceneexpander.errors import UserError
-from sceneexpander.export import main
 from sceneexpander.exports import FORMATS, mesh
 from sceneexpander.exports.mesh import make_collider, make_mesh
 from sceneexpander.exports.scene import Crop, ExportScene, crop_scene, load_scene, place_scene

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sceneexpander.frontend.sparse_points import SparsePoints
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import look_at
 
 
@@ -18,6 +19,10 @@ class Scene:
     depth: Tensor
     world_from_cam: Tensor
     intrinsics_px: Tensor
+
+    @property
+    def cameras(self) -> Cameras:
+        return Cameras(self.world_from_cam, self.intrinsics_px, *self.images.shape[-2:])
 
 
 @dataclass(frozen=True, kw_only=True)

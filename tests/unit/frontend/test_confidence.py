@@ -42,9 +42,7 @@ def test_probabilities_hold_on_held_out_scenes() -> None:
     # Three scenes are no sample of all: half of the gap between the groups is left to chance.
     assert right[sure].mean() > 0.65
     assert right[unsure].mean() < 0.45
-    assert (np.abs(error[sure]) < np.log(1.25)).mean() > 0.95, (
-        "the bar for confident pixels is .96 on the mean of 200 scenes"
-    )
+    assert (np.abs(error[sure]) < np.log(1.25)).mean() > 0.95, "of confident pixels, .96 on the mean of 200 scenes"
 
 
 def test_calibration_reports_bins() -> None:

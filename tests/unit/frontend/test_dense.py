@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sceneexpander.frontend.dense import DenseConfig, DenseDepth, checked_share, dense_depth
 from sceneexpander.frontend.sparse_points import SparsePoints
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 from sceneexpander.training.simulated import perturb_poses, sample_sparse_points
 
@@ -27,8 +28,7 @@ def points_of(scene: scenes.Scene, *, seed: int = 0, outliers: float = 0.03) -> 
         scene.images,
         scene.depth,
         torch.isfinite(scene.depth),
-        scene.world_from_cam,
-        scene.intrinsics_px,
+        scene.cameras,
         torch.Generator().manual_seed(seed),
         per_view=(40, 40),
         outliers=outliers,
@@ -36,7 +36,7 @@ def points_of(scene: scenes.Scene, *, seed: int = 0, outliers: float = 0.03) -> 
 
 
 def run(scene: scenes.Scene, sparse: SparsePoints, config: DenseConfig = CONFIG, **known: Tensor) -> DenseDepth:
-    return dense_depth(scene.images, scene.world_from_cam, scene.intrinsics_px, sparse, config, **known)
+    return dense_depth(scene.images, scene.cameras, sparse, config, **known)
 
 
 def assert_usable(result: DenseDepth, views: int) -> None:
@@ -129,7 +129,8 @@ def test_cameras_that_fit_have_the_larger_checked_share(room: scenes.Scene) -> N
     posed = torch.ones(3, dtype=torch.bool)
 
     def share(poses: Tensor, known: Tensor = posed) -> float:
-        return checked_share(room.images, poses, room.intrinsics_px, sparse, CONFIG, posed=known)
+        cameras = dataclasses.replace(room.cameras, world_from_cam=poses)
+        return checked_share(room.images, cameras, sparse, CONFIG, posed=known)
 
     right = share(room.world_from_cam)
     assert right > 0.5
@@ -181,7 +182,7 @@ def test_no_points_gives_a_smooth_guess(room: scenes.Scene) -> None:
 def test_no_points_and_one_view() -> None:
     image = torch.rand(1, 3, 40, 56, generator=torch.Generator().manual_seed(0))
     intrinsics = torch.tensor([[[50.0, 0, 28], [0, 50, 20], [0, 0, 1]]])
-    result = dense_depth(image, torch.eye(4)[None], intrinsics, SparsePoints.empty(), CONFIG)
+    result = dense_depth(image, Cameras(torch.eye(4)[None], intrinsics, 40, 56), SparsePoints.empty(), CONFIG)
     assert_usable(result, 1)
     assert not bool(result.confident.any())
 
@@ -223,7 +224,7 @@ def test_large_images_are_matched_small_and_answered_large(wall: scenes.Scene) -
     assert float((result.depth / wall.depth - 1).abs().median()) < 0.03
 
 
-@pytest.mark.wrong_shapes
-def test_shapes_that_do_not_belong_together_are_refused(wall: scenes.Scene) -> None:
-    with pytest.raises(ValueError, match="3 images, 2 poses"):
-        dense_depth(wall.images, wall.world_from_cam[:2], wall.intrinsics_px, SparsePoints.empty(), CONFIG)
+def test_pictures_and_cameras_that_do_not_belong_together_are_refused(wall: scenes.Scene) -> None:
+    for cameras in (wall.cameras[:2], wall.cameras.resized(HEIGHT // 2, WIDTH // 2)):
+        with pytest.raises(ValueError, match=f"3 images of {HEIGHT} x {WIDTH} pixels, {len(cameras)} cameras of"):
+            dense_depth(wall.images, cameras, SparsePoints.empty(), CONFIG)

@@ -11,6 +11,7 @@ from sceneexpander.frontend.segments import segment_colours
 from sceneexpander.frontend.sgm import COST_SCALE, aggregate, best_hypothesis
 from sceneexpander.frontend.sparse_points import SparsePoints
 from sceneexpander.geometry.camera import project_points
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.training.simulated import perturb_poses, sample_sparse_points
 
@@ -166,8 +167,7 @@ def test_simulated_points_without_noise_lie_on_the_surface() -> None:
         images,
         depth,
         depth > 0,
-        pose,
-        intrinsics,
+        Cameras(pose, intrinsics, 30, 40),
         torch.Generator().manual_seed(3),
         per_view=(30, 30),
         depth_noise=0,
@@ -185,9 +185,8 @@ def test_simulated_points_without_noise_lie_on_the_surface() -> None:
 def test_simulated_noise_moves_depth_not_pixels_and_skips_invalid() -> None:
     images, depth, pose, intrinsics = tilted_views()
     depth[:, :15] = torch.inf
-    points = sample_sparse_points(
-        images, depth, torch.isfinite(depth), pose, intrinsics, torch.Generator().manual_seed(3), per_view=(40, 40)
-    )
+    cameras, generator = Cameras(pose, intrinsics, 30, 40), torch.Generator().manual_seed(3)
+    points = sample_sparse_points(images, depth, torch.isfinite(depth), cameras, generator, per_view=(40, 40))
     assert bool(torch.isfinite(points.points_world).all())
     assert float(points.pixel_xy[:, 1].min()) >= 15
     assert float(points.points_world[:, 2].std()) > 0.03

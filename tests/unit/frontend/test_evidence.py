@@ -10,12 +10,13 @@ import sfm_worlds as worlds
 from test_epipolar import model_of, noisy, seen_through
 
 from sceneexpander.frontend.bundle import rotation_exp
-from sceneexpander.frontend.evidence import ViewEvidence, common_doubt, weigh_evidence
+from sceneexpander.frontend.evidence import ViewEvidence, common_doubt, halves_apart_deg, weigh_evidence
 from sceneexpander.frontend.lens_tests import find_apart_group, pair_costs, rival_lens_deg
-from sceneexpander.frontend.mapping import directions_between_deg
+from sceneexpander.frontend.mapping import Mapping, directions_between_deg
 from sceneexpander.frontend.search import CameraSearch
 from sceneexpander.frontend.sfm_setup import KnownCameras
 from sceneexpander.frontend.sfm_types import SfmConfig
+from sceneexpander.frontend.tracks import Tracks
 
 CONFIG = SfmConfig()
 FINE = ViewEvidence(
@@ -24,6 +25,7 @@ FINE = ViewEvidence(
     direction_sigma_deg=0.4,
     lens_sigma_deg=0.0,
     rival_angle_deg=0.0,
+    halves_deg=0.0,
     spread_deg=0.0,
 )
 
@@ -119,6 +121,7 @@ def test_doubts_are_no_refusals() -> None:
         {"rotation_gap_deg": 12.0},
         {"direction_sigma_deg": 20.0},
         {"rival_angle_deg": 20.0},
+        {"halves_deg": 20.0},
         {"spread_deg": 20.0},
     ):
         found = replace(FINE, **change)
@@ -127,6 +130,30 @@ def test_doubts_are_no_refusals() -> None:
     nothing = replace(FINE, agreeing=float("nan"), rotation_gap_deg=float("nan"), direction_sigma_deg=float("nan"))
     assert not nothing.refusal(CONFIG)
     assert not nothing.doubt(CONFIG)
+
+
+@pytest.mark.parametrize("relief", [1.0, 0.005])
+def test_halves_of_the_matches_tell_one_camera_only_where_there_is_depth(relief: float) -> None:
+    mapping, tracks = seen_before(relief)
+    apart = halves_apart_deg(mapping, tracks).max()
+    assert apart < 0.5 if relief == 1 else apart > CONFIG.max_halves_deg
+
+
+def test_halves_say_nothing_of_given_poses_nor_where_there_is_little() -> None:
+    mapping, tracks = seen_before(0.005)
+    assert not halves_apart_deg(mapping, tracks, np.zeros(5, bool)).any()
+    few = replace(tracks, seen=tracks.seen & (np.arange(tracks.count) < 50)[:, None])
+    assert not halves_apart_deg(mapping, few).any()
+
+
+def seen_before(relief: float) -> tuple[Mapping, Tracks]:
+    """A model, and what it is made from, before a wall with a share of the relief of a cloud."""
+    world = worlds.point_world(58, points=400)
+    points = world.points.copy()
+    points[:, 2] = 5 + (points[:, 2] - 5) * relief
+    world = replace(world, points=points)
+    world = noisy(replace(world, pixel_xy=worlds.project(world)))
+    return model_of(world)[0], world.tracks
 
 
 def test_two_lenses_taken_for_one_fall_apart_and_one_lens_does_not() -> None:
@@ -166,6 +193,10 @@ def test_directions_between_two_models_are_angles_at_the_views() -> None:
     other.rotations[:2], other.translations[0] = np.eye(3), 0.0
     mapping.translations[1], other.translations[1] = [1.0, 0.0, 0.0], turned @ [2.0, 0.0, 0.0]
     np.testing.assert_allclose(directions_between_deg(mapping, [other])[:2], 30.0)
+    mapping.registered[2], other.registered[2] = True, True  # beside view 1, on another side of it in each
+    mapping.rotations[2] = other.rotations[2] = np.eye(3)
+    mapping.translations[2], other.translations[2] = [1.0, 0.02, 0.0], turned @ [2.0, 0.0, 0.02]
+    np.testing.assert_allclose(directions_between_deg(mapping, [other])[:2], 30.0, atol=2)
     assert not directions_between_deg(mapping, [mapping]).any()
 
 

@@ -105,6 +105,15 @@ def test_points_behind_or_beside_a_camera_are_not_in_frame() -> None:
     assert sample_at(torch.ones(1, 1, 4, 6), found.grid).isfinite().all()
 
 
+def test_a_camera_that_comes_again_is_found_and_one_with_another_lens_is_another() -> None:
+    cameras = some_cameras(0)
+    path = cameras[[0, 1, 2, 1, 0, 2]]
+    assert path.find_repeats() == [0, 1, 2, 1, 0, 2]
+    longer = path.intrinsics_px.clone()
+    longer[4, 0, 0] = torch.nextafter(longer[4, 0, 0], torch.tensor(torch.inf, dtype=longer.dtype))
+    assert dataclasses.replace(path, intrinsics_px=longer).find_repeats() == [0, 1, 2, 1, 4, 2]
+
+
 @pytest.mark.wrong_shapes
 def test_what_does_not_go_together_is_refused() -> None:
     cameras = some_cameras(0)

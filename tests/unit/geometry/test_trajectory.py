@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import pytest
 import torch
 from torch import Tensor
 
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import look_at, quat_wxyz_from_rotation, rotation_angle_deg, rotation_from_quat_wxyz
 from sceneexpander.geometry.trajectory import focus_depth, mean_up, navigation, orbit, shortest_path_order, spiral
 
@@ -28,6 +30,12 @@ def random_cameras(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return look_at(eye, target, UP), k
 
 
+def flown(poses: Tensor, k: Tensor, frames: int, order: Sequence[int]) -> tuple[Tensor, Tensor]:
+    path = navigation(Cameras(poses, k, 80, 100), frames, order)
+    assert (path.height, path.width) == (80, 100)
+    return path.world_from_cam, path.intrinsics_px
+
+
 def frame_of(path: Tensor, pose: Tensor) -> tuple[int, float]:
     error = (path - pose).abs().flatten(1).amax(1)
     return int(error.argmin()), float(error.min())
@@ -37,7 +45,7 @@ def frame_of(path: Tensor, pose: Tensor) -> tuple[int, float]:
 def test_navigation_meets_every_key_in_order(frames: int) -> None:
     poses, k = random_cameras(6)
     order = [2, 0, 5, 1, 4, 3]
-    path, path_k = navigation(poses, k, frames, order)
+    path, path_k = flown(poses, k, frames, order)
     assert path.shape == (frames, 4, 4)
     hits = [frame_of(path, poses[key]) for key in order]
     assert max(error for _, error in hits) < 1e-12  # float64 rounding
@@ -51,7 +59,7 @@ def test_navigation_velocity_is_continuous_and_zero_at_the_ends() -> None:
     poses, k = random_cameras(5)
     sizes = {}
     for frames in (401, 1601):
-        path, path_k = navigation(poses, k, frames, range(5))
+        path, path_k = flown(poses, k, frames, range(5))
         quats = quat_wxyz_from_rotation(path[:, :3, :3])
         quats = (
             quats * torch.cumprod(torch.cat([torch.ones(1), torch.sign((quats[1:] * quats[:-1]).sum(-1))]), 0)[:, None]
@@ -67,7 +75,7 @@ def test_navigation_velocity_is_continuous_and_zero_at_the_ends() -> None:
 
 def test_navigation_poses_are_rigid_and_stay_near_their_keys() -> None:
     poses, k = random_cameras(8, seed=3)
-    path, _ = navigation(poses, k, 200, range(8))
+    path, _ = flown(poses, k, 200, range(8))
     rotation = path[:, :3, :3]
     identity = torch.eye(3, dtype=path.dtype).expand_as(rotation)
     torch.testing.assert_close(rotation @ rotation.transpose(-1, -2), identity)
@@ -78,11 +86,11 @@ def test_navigation_poses_are_rigid_and_stay_near_their_keys() -> None:
 
 def test_navigation_with_coinciding_keys_pauses_without_leaving() -> None:
     poses, k = random_cameras(3)
-    path, _ = navigation(poses, k, 60, [0, 1, 1, 2, 1, 0])
+    path, _ = flown(poses, k, 60, [0, 1, 1, 2, 1, 0])
     assert torch.isfinite(path).all()
     same = (path - poses[1]).abs().flatten(1).amax(1) < 1e-12
     assert same.sum() >= 3
-    still, _ = navigation(poses, k, 10, [1, 1, 1])
+    still, _ = flown(poses, k, 10, [1, 1, 1])
     torch.testing.assert_close(still, poses[1].expand(10, 4, 4))
 
 
@@ -91,7 +99,7 @@ def test_navigation_turns_by_half_turns_and_pure_rotations() -> None:
     poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     poses[:, :3, :3] = half
     _, k = random_cameras(3)
-    path, _ = navigation(poses, k, 41, [0, 1, 2, 0])
+    path, _ = flown(poses, k, 41, [0, 1, 2, 0])
     assert torch.isfinite(path).all()
     assert max(frame_of(path, pose)[1] for pose in poses) < 1e-12
     step = rotation_angle_deg(path[:-1, :3, :3], path[1:, :3, :3])
@@ -100,11 +108,11 @@ def test_navigation_turns_by_half_turns_and_pure_rotations() -> None:
 
 def test_navigation_with_few_frames_and_single_keys() -> None:
     poses, k = random_cameras(4)
-    few, _ = navigation(poses, k, 2, range(4))
+    few, _ = flown(poses, k, 2, range(4))
     torch.testing.assert_close(few, poses[[0, 3]])
-    one, _ = navigation(poses, k, 1, range(4))
+    one, _ = flown(poses, k, 1, range(4))
     torch.testing.assert_close(one[0], poses[0])
-    single, single_k = navigation(poses, k, 5, [2])
+    single, single_k = flown(poses, k, 5, [2])
     torch.testing.assert_close(single, poses[2].expand(5, 4, 4))
     torch.testing.assert_close(single_k, k[2].expand(5, 3, 3))
 
@@ -112,11 +120,11 @@ def test_navigation_with_few_frames_and_single_keys() -> None:
 def test_navigation_refuses_nonsense() -> None:
     poses, k = random_cameras(3)
     with pytest.raises(ValueError, match="at least one key"):
-        navigation(poses, k, 5, [])
+        flown(poses, k, 5, [])
     with pytest.raises(ValueError, match="outside"):
-        navigation(poses, k, 5, [0, 3])
+        flown(poses, k, 5, [0, 3])
     with pytest.raises(ValueError, match="not finite"):
-        navigation(poses * torch.nan, k, 5, [0, 1])
+        flown(poses * torch.nan, k, 5, [0, 1])
 
 
 def test_shortest_path_is_the_best_of_all_orders() -> None:

@@ -245,7 +245,7 @@ def test_floating_point_samples(channels: int, dtype: type) -> None:
     samples = ramp if channels == 1 else np.stack([ramp] * 3, -1)
     assert np.array_equal(decode(tiff(samples))[0, :, 0], np.arange(256))
     assert np.array_equal(decode(tiff(samples * 255))[0, :, 0], np.arange(256))
-    for factor, expected in ((40, "from 0 to 40"), (4000, "from 0 to 4000"), (np.nan, "nan"), (-1, "from -1")):
+    for factor, expected in ((40, "from 0 to 40"), (4000, "from 0 to 4000"), (np.nan, "finite"), (-1, "from -1")):
         assert expected in error_line(tiff((samples * factor).astype(dtype)))
 
 

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
+import shutil
+import threading
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +18,16 @@ from PIL import Image
 
 from sceneexpander.artifacts.scene import Scene
 from sceneexpander.errors import UserError
-from sceneexpander.ingest import IngestConfig, list_pictures, load_photos, load_scene, make_round, read_views, safe_name
+from sceneexpander.ingest import (
+    IngestConfig,
+    list_pictures,
+    load,
+    load_photos,
+    load_scene,
+    make_round,
+    read_views,
+    safe_name,
+)
 from sceneexpander.ingest.survey import natural_key
 
 CONFIG = IngestConfig(long_side_px=56)
@@ -260,3 +275,80 @@ def test_folder_of_candidates_has_one_digest(tmp_path: Path) -> None:
 def test_config_ranges(settings: dict[str, object]) -> None:
     with pytest.raises(UserError, match=rf"^(ingest\.)?{next(iter(settings))}: "):
         IngestConfig(**settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def several_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def mixed_photos(folder: Path) -> list[Path]:
+    """Of several formats; a copy, one of a single colour and one with bars among them."""
+    paths = [photo(folder / f"{index}.{ending}", index) for index, ending in enumerate(("png", "tiff", "jpg", "png"))]
+    paths.append(folder / "copy.png")
+    shutil.copyfile(paths[0], paths[-1])
+    paths.append(folder / "grey.png")
+    Image.new("RGB", (120, 80), (90, 90, 90)).save(paths[-1])
+    with Image.open(photo(folder / "barred.png", 7)) as picture:
+        picture.paste((0, 0, 0), (0, 0, 120, 12))
+        picture.save(folder / "barred.png")
+    return [*paths, folder / "barred.png"]
+
+
+@pytest.mark.usefixtures("several_threads")
+def test_photos_that_are_read_side_by_side_are_those_read_one_after_the_other(tmp_path: Path) -> None:
+    paths = mixed_photos(tmp_path)
+    together = read_views(paths, CONFIG)
+    torch.set_num_threads(1)
+    alone = read_views(paths, CONFIG)
+    assert together.notes == alone.notes
+    assert len(alone.notes) == 3
+    assert together.views.records == alone.views.records
+    assert torch.equal(together.views.images, alone.views.images)
+    assert torch.equal(together.views.validity(), alone.views.validity())
+
+
+@pytest.mark.usefixtures("several_threads")
+def test_reading_side_by_side_leaves_messages_and_warnings_as_they_were(tmp_path: Path) -> None:
+    paths = [photo(tmp_path / f"{index}.png", index, (60, 90)) for index in range(12)]
+    before, filters = os.fstat(2), list(warnings.filters)
+    read_views(paths, CONFIG)
+    assert (os.fstat(2).st_dev, os.fstat(2).st_ino) == (before.st_dev, before.st_ino)
+    assert warnings.filters == filters
+
+
+@pytest.mark.usefixtures("several_threads")
+@pytest.mark.parametrize(("allowed", "most"), [(1.0, 3), (0.01, 1)])
+def test_pictures_are_read_side_by_side_only_while_they_are_small(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, allowed: float, most: int
+) -> None:
+    paths = [photo(tmp_path / f"{index}.png", index) for index in range(6)]
+    inside, counts, lock, read = [0], list[int](), threading.Lock(), load._read_shot
+    everyone = threading.Barrier(most)
+
+    def counted(*arguments: Any) -> Any:
+        with lock:
+            inside[0] += 1
+            counts.append(inside[0])
+        everyone.wait(timeout=10)
+        found = read(*arguments)
+        with lock:
+            inside[0] -= 1
+        return found
+
+    monkeypatch.setattr(load, "_read_shot", counted)
+    monkeypatch.setattr(load, "_MEGAPIXELS_AT_ONCE", allowed)
+    assert len(read_views(paths, CONFIG).views) == len(paths)
+    assert max(counts) == most
+
+
+@pytest.mark.usefixtures("several_threads")
+def test_the_first_unusable_photo_is_the_one_that_is_named(tmp_path: Path) -> None:
+    paths = [photo(tmp_path / f"{index}.png", index) for index in range(6)]
+    for broken in (2, 4):
+        paths[broken].write_bytes(paths[broken].read_bytes()[:200])
+    with pytest.raises(UserError, match=r"2\.png"):
+        read_views(paths, CONFIG)

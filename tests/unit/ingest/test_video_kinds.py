@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneexpander.ingest.sources import Capture, read_capture
+from sceneexpander.errors import UserError
+from sceneexpander.ingest.sources import Capture, find_source, read_capture
 from tests.worlds.captures import CONFIG
+from tests.worlds.photos import texture
 
 pytestmark = pytest.mark.timeout(60)
 HEIGHT, WIDTH = 64, 96
@@ -76,3 +78,21 @@ def test_parts_are_of_equal_time_whatever_the_frame_rate(tmp_path: Path) -> None
     assert parts == sorted(set(parts)), "one of each part that shows something"
     assert len(taken) >= 4
     assert sum(second < 1 for second in taken) <= 2, "not one of every so many frames"
+
+
+def test_an_animated_gif_is_a_video_and_a_single_picture_is_none(tmp_path: Path) -> None:
+    frames = [texture(index, 60, 80) for index in range(6)]
+    frames[0].save(tmp_path / "walk.gif", save_all=True, append_images=frames[1:], duration=200)
+    assert find_source(tmp_path / "walk.gif") == "video"
+    assert len(read_capture(tmp_path / "walk.gif", replace(CONFIG, video_fps=5.0)).shots) == 6
+    frames[0].save(tmp_path / "one.png")
+    with pytest.raises(UserError, match=r"one\.png: is one picture; give the folder"):
+        read_capture(tmp_path / "one.png", CONFIG)
+
+
+def test_what_ffmpeg_refuses_is_said_in_its_words_alone(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_text("no video")
+    with pytest.raises(UserError) as caught:
+        read_capture(tmp_path / "a.mp4", CONFIG)
+    assert caught.value.line().count("a.mp4") == 1
+    assert "Errno" not in caught.value.line()

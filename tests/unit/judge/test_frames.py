@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from sceneexpander.artifacts.store import ArtifactError
+from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.trajectory import navigation
 from sceneexpander.judge.frames import choose_frames, read_frames
 from sceneexpander.splatting.video import write_video
@@ -35,7 +36,8 @@ def test_the_tour_is_a_way_there_and_back(frames: int) -> None:
     """Whole frames at the key cameras make it a little uneven."""
     keys = path_along(torch.tensor([0.0, 0.4, 1.5, 2.2]))
     keys[:, 2, 3] = torch.tensor([0.0, 1.0, 0.7, 0.1])
-    tour, _ = navigation(keys, torch.eye(3).expand(4, 3, 3), frames, [0, 1, 2, 3, 2, 1, 0])
+    cameras = Cameras(keys, torch.eye(3).expand(4, 3, 3), 4, 6)
+    tour = navigation(cameras, frames, [0, 1, 2, 3, 2, 1, 0]).world_from_cam
     goal = int((tour[:, 0, 3] - 2.2).abs().argmin())
     chosen = choose_frames(tour, goal, 8)
     assert len(chosen) == 8

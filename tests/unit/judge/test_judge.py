@@ -13,9 +13,9 @@ from PIL import Image
 
 from sceneexpander.artifacts.judgement import JudgedRound, MethodScore
 from sceneexpander.errors import UserError
-from sceneexpander.judge import judge_round, make_judge
+from sceneexpander.judge.ask import make_judge
 from sceneexpander.judge.config import NoJudgeConfig
-from sceneexpander.judge.rounds import questions_of
+from sceneexpander.judge.rounds import judge_round, questions_of
 from tests.support.loopback import Answer, Service, error, said
 from tests.worlds.judged import KEY, judge_of, message, preferred, refusal, scored, settings, work_of
 

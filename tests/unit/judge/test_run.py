@@ -13,10 +13,10 @@ from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.judgement import JudgedRound
 from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.unavailable import Unavailable
+from sceneexpander.cli.judge_run import judge_run, parse_arguments
 from sceneexpander.config.compose import compose
 from sceneexpander.config.files import write_yaml
 from sceneexpander.errors import UserError
-from sceneexpander.judge_run import judge_run, parse_arguments
 from sceneexpander.pipeline.preflight import check_scene
 from sceneexpander.pipeline.project import JUDGED_FOLDER, ROOT_ENV
 from sceneexpander.splatting.video import write_video

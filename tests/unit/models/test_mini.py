@@ -23,7 +23,7 @@ from sceneexpander.models.mini.splats import covered_by_others
 from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS, Head, Reconstructor
 from sceneexpander.models.registry import build_reconstructor
 from sceneexpander.synthetic.views import make_views
-from sceneexpander.training.augment import augment, mirrored
+from sceneexpander.training.augment import augment, mirror_sample
 from sceneexpander.training.buffer import samples_folder
 from sceneexpander.training.generate import (
     Conditions,
@@ -380,7 +380,7 @@ def test_a_stored_sample_is_the_sample(held_out: list[Sample], tmp_path: Path) -
 
 
 def test_a_mirrored_sample_is_still_true(held_out: list[Sample]) -> None:
-    sample = mirrored(held_out[0])
+    sample = mirror_sample(held_out[0])
     depth = torch.where(sample.valid, sample.log_depth, 0.0).exp()
     found = normals_from_depth(depth[:1], sample.intrinsics_px[:1], smoothing=0)
     inner = sample.valid[:1].clone()

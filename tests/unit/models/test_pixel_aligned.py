@@ -86,16 +86,16 @@ def test_a_plane_seen_from_two_cameras_renders_back_to_both_pictures() -> None:
     )
     rendered = render(gaussians, Cameras(poses, intrinsics, HEIGHT, WIDTH)).rgb
     # On a slanted surface the nearer neighbours cover part of every pixel, which displaces the picture by about half a pixel and
-    # blurs it by one: 29 dB for this pattern. A further pixel off or Gaussians of 1 px cost 2 dB and more. The bar lies between.
-    bar = 28.5
-    assert min(psnr_db(a, b) for a, b in zip(rendered, images, strict=True)) > bar
+    # blurs it by one: 29 dB for this pattern. A further pixel off or Gaussians of 1 px cost 2 dB and more. The limit lies between.
+    least_db = 28.5
+    assert min(psnr_db(a, b) for a, b in zip(rendered, images, strict=True)) > least_db
     shifted = intrinsics.clone()
     shifted[:, :2, 2] += 1
     for camera, rule in ((shifted, SplatRule()), (intrinsics, SplatRule(std_px=1.0))):
         worse = pixel_aligned(
             images=images, depth=depth, depth_conf=conf, cameras=Cameras(poses, camera, *images.shape[2:]), rule=rule
         )
-        assert psnr_db(render(worse, Cameras(poses, intrinsics, HEIGHT, WIDTH)).rgb, images) < bar - 1
+        assert psnr_db(render(worse, Cameras(poses, intrinsics, HEIGHT, WIDTH)).rgb, images) < least_db - 1
 
 
 def test_a_surface_has_no_holes_even_from_somewhat_nearer() -> None:

@@ -13,7 +13,7 @@ from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.optimisation.config import DensityConfig
 from sceneexpander.optimisation.density import CloneAndSplit, Relocation, Schedule, shared_appearance
-from sceneexpander.optimisation.splats import thinned
+from sceneexpander.optimisation.splats import thin_gaussians
 from sceneexpander.splatting import render
 from tests.worlds.few_splats import CONFIG, five, generator, moved, seen, splats_of
 from tests.worlds.random_gaussians import cameras, intrinsics, random_gaussians
@@ -170,9 +170,9 @@ def test_noise_moves_the_transparent_within_their_shape() -> None:
 
 def test_thinning_keeps_what_is_covered() -> None:
     start = random_gaussians(1000)
-    kept = thinned(start, 250, generator())
+    kept = thin_gaussians(start, 250, generator())
     assert len(kept) == 250
     rows = [(start.means == mean).all(-1).nonzero()[0, 0] for mean in kept.means]
     torch.testing.assert_close(kept.scales, 2 * start.scales[rows])
     assert torch.equal(kept.source_view, start.source_view[rows])
-    assert thinned(start, 1000, generator()) is start
+    assert thin_gaussians(start, 1000, generator()) is start

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -46,6 +48,28 @@ def test_what_it_leaves_is_what_the_stage_would(stage, folder: Path, monkeypatch
     import_module(module).main()
     assert made == {path: path.read_bytes() for path in outputs[0].rglob("*") if path.is_file()}
     assert made
+
+
+_SAY_SO = """
+import importlib, sys
+for command in sys.argv[1:]:
+    module, *sys.argv[1:] = command.split()
+    importlib.import_module(module).main()
+print(sorted({"torch", "numpy", "cv2", "mlflow", "hydra", "rich"} & set(sys.modules)))
+"""
+
+
+def test_a_stage_that_only_says_so_starts_in_no_time(folder: Path) -> None:
+    """With plain ``dvc repro`` each is a process: what takes seconds there is the import of torch."""
+    (judge,) = [stage for stage in read_pipeline(ROOT) if stage.name == "judge"]
+    (settings,) = [file for file in judge.parameters if file.endswith("config.yaml")]
+    write_yaml(folder / settings, {"judge": {"backend": "none"}})
+    commands = [stage.command.replace("'", "").removeprefix("python -m ") for stage in (*UNASKED, judge)]
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'src'}"}
+    script = [sys.executable, "-c", _SAY_SO, *commands]
+    done = subprocess.run(script, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    assert all(Path(output.path).exists() for stage in (*UNASKED, judge) for output in stage.outputs)
 
 
 def test_the_stages_are_those_of_methods_that_can_be_left_out() -> None:

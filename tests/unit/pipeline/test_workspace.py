@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from sceneexpander.cli.expand import parse_arguments, stage_scene
 from sceneexpander.errors import UserError
-from sceneexpander.expand import parse_arguments, stage_scene
 from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, merged_overrides
 

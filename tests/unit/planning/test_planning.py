@@ -10,9 +10,9 @@ import torch
 from torch import nn
 
 from sceneexpander.adaptation.config import AdaptConfig, EngineConfig, MomentsForm
+from sceneexpander.cli.plan import main, parse, request_of
 from sceneexpander.models.protocol import ALL_HEADS, GEOMETRY_HEADS
 from sceneexpander.models.worldmirror import WorldMirror
-from sceneexpander.plan import main, parse, request_of
 from sceneexpander.planning import Meter, PlanRequest, adaptation_cost, inference_cost, step_views
 from sceneexpander.planning import simulate as simulations
 from sceneexpander.planning.models import planned_model

@@ -16,6 +16,7 @@ from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.rendering.config import EyeKey, RenderConfig, ViewKey
 from sceneexpander.rendering.produce import produce_renders
 from sceneexpander.rendering.tour import plan_tour
+from sceneexpander.splatting import render
 from sceneexpander.splatting.spz import read_spz
 from tests.worlds.row_of_views import reconstruction
 
@@ -34,6 +35,28 @@ def test_it_starts_and_ends_at_a_captured_camera_and_visits_the_inserted_one() -
     torch.testing.assert_close(tour.cameras.world_from_cam[tour.inserted_frame], BACKBONE.world_from_cam[3])
     torch.testing.assert_close(x, x.flip(0), atol=1e-5, rtol=0)
     assert tour.inserted_camera == "backbone"
+
+
+@pytest.mark.parametrize("frames", [9, 10])
+def test_the_way_back_is_the_way_there_and_is_not_drawn_again(
+    frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+
+    def count(*given: Any, **settings: Any) -> Any:
+        drawn.append(given)
+        return render(*given, **settings)
+
+    monkeypatch.setattr("sceneexpander.rendering.produce.render", count)
+    done = produce_renders(BACKBONE, BACKBONE, replace(CONFIG, frames=frames, stills=frames), tmp_path)
+    assert torch.equal(done.world_from_cam, done.world_from_cam.flip(0))
+    assert torch.equal(done.intrinsics_px, done.intrinsics_px.flip(0))
+    assert len(drawn) == 5 + len(done.views)
+    stills = [picture for _, picture in done.stills]
+    assert len(stills) == frames
+    for there, back in zip(stills, stills[::-1], strict=True):
+        assert (tmp_path / there["provenance"]).read_bytes() == (tmp_path / back["provenance"]).read_bytes()
+    assert (tmp_path / stills[0]["rgb"]).read_bytes() != (tmp_path / stills[4]["rgb"]).read_bytes()
 
 
 def test_before_the_insertion_the_camera_comes_from_the_reference_in_this_gauge() -> None:

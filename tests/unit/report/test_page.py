@@ -10,11 +10,14 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from sceneexpander.artifacts.held_out import HeldOut
+from sceneexpander.artifacts.held_out_seen import HeldOutSeen
 from sceneexpander.artifacts.inserted import InsertedView
-from sceneexpander.artifacts.metrics import Fit, MetricsRow
+from sceneexpander.artifacts.metrics import Fit, MetricsRow, ViewMetrics
 from sceneexpander.artifacts.page import Refinement, ScenePage
 from sceneexpander.artifacts.source_type import read_source_type
 from sceneexpander.artifacts.store import ArtifactError, read_json, write_json_atomic
+from sceneexpander.artifacts.views import save_png
 from sceneexpander.report import RoundSource, SceneSource, collect_scene, write_page
 from sceneexpander.report.course import fits
 from sceneexpander.report.curve import Curve, curve_chart, objective_curves
@@ -26,6 +29,7 @@ from tests.worlds.reports import (
     HARM,
     METHODS,
     save_looks,
+    view,
 )
 
 
@@ -243,6 +247,57 @@ def test_runs_to_track_come_from_the_same_folder(gathered: Path, tmp_path: Path)
             assert path.is_file(), place
             assert place.rpartition("/")[2] == path.name
     assert scene_runs(gathered, commit="other")[0].key == scene_runs(gathered, commit="abc")[0].key
+
+
+@pytest.fixture
+def with_held_out(source: SceneSource, tmp_path: Path) -> SceneSource:
+    """A held-out photo that has a camera in the scene of two methods and none in that of the third."""
+    photo = view("v-held")
+    HeldOut(views=photo).save(tmp_path / "photos")
+    methods = []
+    for item in source.rounds[0].methods:
+        if item.name == "ttt3r":
+            methods.append(item)
+            continue
+        posed = item.name != "captured"
+        place = tmp_path / item.name
+        place.mkdir()
+        save_png(place / "v-held.png", photo.images[0] * (0.5 if item.name == "backbone" else 0.9))
+        HeldOutSeen(pictures={"v-held": "v-held.png"} if posed else {}).save(place)
+        measured = ViewMetrics(
+            view_id="v-held", generated=False, posed=posed, values={"psnr_held_out_db": 17.125} if posed else {}
+        )
+        replace(MetricsRow.load(item.metrics), held_out=(measured,)).save(tmp_path / f"{item.name}.json")
+        methods.append(replace(item, held_out=place, metrics=tmp_path / f"{item.name}.json"))
+    return replace(source, held_out=tmp_path / "photos", rounds=[replace(source.rounds[0], methods=methods)])
+
+
+def test_a_held_out_photo_stands_beside_what_each_scene_shows_from_there(
+    with_held_out: SceneSource, tmp_path: Path
+) -> None:
+    collect_scene(with_held_out, tmp_path / "pages" / "room")
+    write_page([tmp_path / "pages" / "room"], tmp_path / "report")
+    html = (tmp_path / "report" / "index.html").read_text()
+    links = Links()
+    links.feed(html)
+    assert all((tmp_path / "report" / place).is_file() for place in links.found)
+    shown = html[html.index("Held-out photos, beside") : html.index("Every view, rendered")]
+    assert "v-held.jpg" in shown
+    assert shown.count("17.12 dB") == 2
+    assert shown.count("no camera in its scene") == 1
+    assert shown.count("<img") == 3
+    runs = {run.tags["method"]: run for run in scene_runs(tmp_path / "pages" / "room", commit="abc")}
+    names = {name for name in runs["backbone"].pictures if "held-out" in name}
+    assert len(names) == 2
+    for name in names:
+        (step, path), *_ = runs["backbone"].pictures[name]
+        assert step == 0
+        assert path.is_file()
+    assert not any("held-out" in name for name in runs["captured"].pictures)
+
+
+def test_without_held_out_photos_the_page_is_silent_about_them(page: Path) -> None:
+    assert "Held-out photos, beside" not in page.read_text()
 
 
 def test_facts_hold_no_absolute_path(gathered: Path) -> None:

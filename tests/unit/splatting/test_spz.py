@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import math
 from collections.abc import Callable
@@ -128,6 +129,36 @@ def test_an_independent_reader_sees_the_same(tmp_path: Path) -> None:
     ]
     for their, our in pairs:
         torch.testing.assert_close(torch.tensor(np.asarray(their)).abs(), our.abs(), atol=1e-5, rtol=0)
+
+
+# `random_gaussians(4)` as the format's own library writes it (its WebAssembly build, @adobe/spz 0.2.3), told of y down and z forward.
+FROM_THE_LIBRARY = {
+    3: (
+        "H4sIAAAAAAAAAwGEAHv/TkdTUAMAAAAEAAAAAQwBAMsOANECAOsUAHUFAGkKAG0NAN8DAPT3/+gGACH8/7oFAEH+/32Sf0mHkYVqYICMe3d1"
+        "hHJ4cX1ren1jem5ze29tgE6yRiT1cX4TORNkQVSliv+GKaJFfByLlE16eUm6e7N8/1qdfBqbYlJpbG2Dp22JspVmsX8OsIQAAAA="
+    ),
+    4: (
+        "TkdTUAQAAAAEAAAAAQwBBiAAAAAAAAAAAAAAAAAAAAAtAAAAAAAAACQAAAAAAAAADQAAAAAAAAAEAAAAAAAAABUAAAAAAAAADAAAAAAAAAAV"
+        "AAAAAAAAAAwAAAAAAAAAGQAAAAAAAAAQAAAAAAAAAC0AAAAAAAAAJAAAAAAAAAAotS/9ICQhAQDLDgDRAgDrFAB1BQBpCgBtDQDfAwD09//o"
+        "BgAh/P+6BQBB/v8otS/9IAQhAAB9kn9JKLUv/SAMYQAAh5GFamCAjHt3dYRyKLUv/SAMYQAAeHF9a3p9Y3puc3tvKLUv/SAQgQAAbYBOskYk"
+        "9XF+EzkTZEFUpSi1L/0gJCEBAIr/himiRXwci5RNenlJunuzfP9anXwam2JSaWxtg6dtibKVZg=="
+    ),
+}
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_what_the_library_of_the_format_writes_is_read(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "theirs.spz"
+    path.write_bytes(base64.b64decode("".join(FROM_THE_LIBRARY[version])))
+    read, wanted = read_spz(path), random_gaussians(4)
+    assert read.antialiased
+    torch.testing.assert_close(read.means, wanted.means, atol=2**-13, rtol=0)  # it keeps 12 fractional bits
+    torch.testing.assert_close(read.opacities, wanted.opacities, atol=0.5 / 255 + 1e-6, rtol=0)
+    assert float((read.scales / wanted.scales).log().abs().max()) <= 1 / 32 + 1e-5
+    turned = rotation_angle_deg(rotation_from_quat_wxyz(read.quat_wxyz), rotation_from_quat_wxyz(wanted.quat_wxyz))
+    assert float(turned.max()) < 0.3
+    torch.testing.assert_close(read.sh[:, 0], wanted.sh[:, 0], atol=0.5 / 255 / 0.15 + 1e-5, rtol=0)
+    torch.testing.assert_close(read.sh[:, 1:], wanted.sh[:, 1:].clamp(-1, 127 / 128), atol=1e-2, rtol=0)  # 8 bits
 
 
 def test_what_had_to_be_cut_is_counted(tmp_path: Path) -> None:

@@ -11,31 +11,32 @@ import torch
 from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.synthetic import build_world, encode_radiance, render_world
 from sceneexpander.synthetic.misalign import Misalignment, deformed_world, misalign, smooth_warp, warp_image
-from sceneexpander.synthetic.trajectories import pose_from_angles
+from sceneexpander.synthetic.trajectories import pose_from_angles, same_lens
 
 HEIGHT, WIDTH = 48, 64
-CAMERA = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
 
 
 @pytest.fixture(scope="module")
 def view() -> tuple:
     world = build_world(np.random.default_rng(4), "room")
-    return world, pose_from_angles(world.bounds.mean(0).astype(np.float64), 0.4, 0.0, 0.0)
+    pose = pose_from_angles(world.bounds.mean(0).astype(np.float64), 0.4, 0.0, 0.0)
+    return world, same_lens(pose, 50.0, HEIGHT, WIDTH)
 
 
 def test_grade_zero_changes_nothing(view: tuple) -> None:
-    world, pose = view
-    clean = render_world(world, pose[None], CAMERA[None], HEIGHT, WIDTH)
-    same = misalign(world, pose, CAMERA, HEIGHT, WIDTH, Misalignment.graded(0), np.random.default_rng(0), exposure=1.0)
+    world, camera = view
+    clean = render_world(world, camera)
+    same = misalign(world, camera, Misalignment.graded(0), np.random.default_rng(0), exposure=1.0)
     np.testing.assert_allclose(same.image, encode_radiance(clean.radiance[0], 1.0), atol=1e-5)
     np.testing.assert_array_equal(same.object_id, clean.object_id[0])
     assert same.moved == ()
 
 
 def test_pose_shift_and_gains_are_as_asked(view: tuple) -> None:
-    world, pose = view
+    world, camera = view
     asked = Misalignment(rotation_deg=3.0, translation_fraction=0.05, exposure_stops=0.5, white_balance=0.1)
-    got = misalign(world, pose, CAMERA, HEIGHT, WIDTH, asked, np.random.default_rng(1), exposure=1.0)
+    got = misalign(world, camera, asked, np.random.default_rng(1), exposure=1.0)
+    pose = camera.world_from_cam[0].numpy()
     angle = rotation_angle_deg(torch.from_numpy(pose[:3, :3]), torch.from_numpy(got.world_from_used_cam[:3, :3]))
     assert float(angle) == pytest.approx(3.0, abs=1e-4)
     step = np.linalg.norm(got.world_from_used_cam[:3, 3] - pose[:3, 3])
@@ -45,22 +46,20 @@ def test_pose_shift_and_gains_are_as_asked(view: tuple) -> None:
 
 
 def test_errors_grow_with_the_grade(view: tuple) -> None:
-    world, pose = view
-    clean = encode_radiance(render_world(world, pose[None], CAMERA[None], HEIGHT, WIDTH).radiance[0], 1.0)
+    world, camera = view
+    clean = encode_radiance(render_world(world, camera).radiance[0], 1.0)
     errors = []
     for grade in (0.0, 0.5, 1.0, 2.0):
         settings = Misalignment.graded(grade)
-        got = misalign(world, pose, CAMERA, HEIGHT, WIDTH, settings, np.random.default_rng(2), exposure=1.0)
+        got = misalign(world, camera, settings, np.random.default_rng(2), exposure=1.0)
         errors.append(float(np.abs(got.image - clean).mean()))
     assert errors == sorted(errors)
     assert errors[1] > errors[0] + 1e-3
 
 
 def test_hallucination_adds_a_named_object(view: tuple) -> None:
-    world, pose = view
-    got = misalign(
-        world, pose, CAMERA, HEIGHT, WIDTH, Misalignment(hallucinate=True), np.random.default_rng(3), exposure=1.0
-    )
+    world, camera = view
+    got = misalign(world, camera, Misalignment(hallucinate=True), np.random.default_rng(3), exposure=1.0)
     names = got.world.object_names
     assert len(names) == len(world.object_names) + 1
     assert names[-1].startswith("hallucinated ")
@@ -101,9 +100,9 @@ def test_warp_is_smooth_and_bounded() -> None:
     ],
 )
 def test_the_truth_map_says_where_everything_went(view: tuple, asked: Misalignment) -> None:
-    world, pose = view
-    clean = render_world(world, pose[None], CAMERA[None], HEIGHT, WIDTH).object_id[0].astype(np.float32)
-    got = misalign(world, pose, CAMERA, HEIGHT, WIDTH, asked, np.random.default_rng(6), exposure=1.0)
+    world, camera = view
+    clean = render_world(world, camera).object_id[0].astype(np.float32)
+    got = misalign(world, camera, asked, np.random.default_rng(6), exposure=1.0)
     undone = warp_image(clean, got.warp_px, nearest=True)
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     there = np.stack([x, y], -1) + got.warp_px
@@ -116,11 +115,11 @@ def test_the_truth_map_says_where_everything_went(view: tuple, asked: Misalignme
 
 
 def test_stretch_zoom_and_shift_are_as_asked(view: tuple) -> None:
-    world, pose = view
+    world, camera = view
     middle = HEIGHT // 2, WIDTH // 2
 
     def map_of(asked: Misalignment) -> np.ndarray:
-        got = misalign(world, pose, CAMERA, HEIGHT, WIDTH, asked, np.random.default_rng(7), exposure=1.0)
+        got = misalign(world, camera, asked, np.random.default_rng(7), exposure=1.0)
         return got.warp_px
 
     stretched, zoomed = map_of(Misalignment(stretch=0.08)), map_of(Misalignment(zoom=0.2))

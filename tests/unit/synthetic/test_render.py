@@ -9,10 +9,9 @@ from sceneexpander.synthetic import KINDS, Material, Shape, TextureKey, WorldBui
 from sceneexpander.synthetic.intersect import first_hit
 from sceneexpander.synthetic.render import trace_camera, trace_rays
 from sceneexpander.synthetic.textures import LEVEL_START, SIZE, packed_texture, weight_map
-from sceneexpander.synthetic.trajectories import pose_from_angles
+from sceneexpander.synthetic.trajectories import pose_from_angles, same_lens
 
 HALF = (0.6, 0.4, 0.5)
-CAMERA = np.array([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]])
 
 
 def _inside(shape: Shape, extra: float, p: np.ndarray) -> np.ndarray:
@@ -69,7 +68,7 @@ def test_screen_rectangles_lose_nothing(kind: str) -> None:
     world = build_world(np.random.default_rng(2), kind)
     eye = world.bounds.mean(0).astype(np.float64)
     pose = pose_from_angles(eye, 0.7, -0.1, 0.05)
-    depth, ids = trace_camera(world, pose, CAMERA, 48, 64)
+    depth, ids = trace_camera(world, same_lens(pose, 40.0, 48, 64))
     x, y = np.meshgrid((np.arange(64) + 0.5 - 32) / 40, (np.arange(48) + 0.5 - 24) / 40)
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3].T
     brute = trace_rays(world, np.broadcast_to(eye, rays.shape).astype(np.float32), rays.astype(np.float32))
@@ -91,7 +90,7 @@ def test_shadow_falls_where_the_light_is_blocked() -> None:
     b.lights.append(Light(position=(0.0, 0.0, 1.0), colour=(1.0, 1.0, 1.0), sun=True))
     b.ambient = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     pose = pose_from_angles(np.array([0.0, 0.0, 1.5]), 0.0, -np.pi / 2 + 1e-3, 0.0)
-    picture = render_world(b.build(), pose[None], CAMERA[None], 48, 64, supersample=1.0)
+    picture = render_world(b.build(), same_lens(pose, 40.0, 48, 64), supersample=1.0)
     luminance = picture.radiance[0].mean(-1)
     # From 1.5 m the slab's shadow, 1 m wide, covers 40 / 1.5 = 27 pixels.
     assert luminance[16:32, 24:40].max() < 1e-6
@@ -107,7 +106,7 @@ def test_ambient_occlusion_darkens_corners() -> None:
     b.at((0, 0, 0), name="wall").add(Shape.BOX, (2.5, 0, 2), (0.5, 20, 2), white)
     pose = pose_from_angles(np.array([0.0, 0.0, 1.5]), 0.0, -0.6, 0.0)
     options = {"supersample": 1.0, "ambient_samples": 16}
-    picture = render_world(b.build(), pose[None], CAMERA[None], 48, 64, **options)
+    picture = render_world(b.build(), same_lens(pose, 40.0, 48, 64), **options)
     floor = picture.object_id[0] == 0
     # Bottom rows look at the floor near the camera; the topmost floor row touches the wall.
     rows = np.flatnonzero(floor[:, 32])

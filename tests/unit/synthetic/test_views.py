@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from sceneexpander.geometry.camera import project_points, unproject_depth, unproject_to_world
-from sceneexpander.synthetic import KINDS, SyntheticViews, make_views
-from sceneexpander.synthetic.trajectories import MIN_CLEARANCE_M
+from sceneexpander.synthetic import KINDS, SyntheticViews, build_world, make_views
+from sceneexpander.synthetic.bundled import unseen_by
+from sceneexpander.synthetic.render import trace_camera
+from sceneexpander.synthetic.trajectories import MIN_CLEARANCE_M, pairwise_overlap, pose_from_angles, same_lens
 from sceneexpander.synthetic.views import make_scene
 
 HEIGHT, WIDTH = 64, 80
@@ -98,12 +100,12 @@ def test_same_seed_same_bits_other_seed_other_picture(degrade: bool) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_cameras_overlap_and_stay_out_of_objects(seed: int) -> None:
-    world, cameras = make_scene(seed, views=4, height=HEIGHT, width=WIDTH)
-    assert (world.clearance(cameras.world_from_cam[:, :3, 3]) > MIN_CLEARANCE_M).all()
-    mutual = (cameras.overlap + cameras.overlap.T) / 2
+    world, chosen = make_scene(seed, views=4, height=HEIGHT, width=WIDTH)
+    assert (world.clearance(chosen.cameras.centres.numpy()) > MIN_CLEARANCE_M).all()
+    mutual = (chosen.overlap + chosen.overlap.T) / 2
     np.fill_diagonal(mutual, 0)
     for view in range(4):
-        if view == cameras.disconnected:
+        if view == chosen.disconnected:
             assert mutual[view].max() < 0.03
         else:
             # Measured on the same coarse grid as the rule.
@@ -127,3 +129,15 @@ def test_splits_share_no_texture() -> None:
 def test_unknown_kind_is_refused() -> None:
     with pytest.raises(ValueError, match="unknown scene kind 'beach'"):
         make_views(0, views=2, height=16, width=16, kind="beach")
+
+
+def test_a_longer_lens_sees_the_middle_of_what_the_wide_one_sees() -> None:
+    world = build_world(np.random.default_rng(4), "room")
+    pose = pose_from_angles(world.bounds.mean(0).astype(np.float64), 0.4, 0.0, 0.0)
+    cameras = same_lens(pose, 40.0, 48, 64).followed_by(same_lens(pose, 80.0, 48, 64))
+    depth = np.stack([trace_camera(world, cameras[index])[0] for index in range(2)])
+    overlap = pairwise_overlap(cameras, depth.astype(np.float64))
+    assert overlap[1, 0] > 0.98
+    assert overlap[0, 1] == pytest.approx(0.25, abs=0.02)
+    assert unseen_by(depth[1], cameras[1], depth[:1], cameras[:1]).mean() < 0.02
+    assert unseen_by(depth[0], cameras[0], depth[1:], cameras[1:]).mean() == pytest.approx(0.75, abs=0.02)

@@ -20,7 +20,7 @@ import pytest
 from sceneexpander.errors import UserError
 from sceneexpander.pipeline.processes import kept
 from sceneexpander.tracking import TrackingConfig, record_runs
-from sceneexpander.tracking.server import require_server, shown, where_runs_go
+from sceneexpander.tracking.server import hide_credentials, require_server, where_runs_go
 from sceneexpander.tracking.store import (
     COMPLETE_TAG,
     KEY_TAG,
@@ -140,7 +140,7 @@ def test_a_server_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         require_server(TrackingConfig(uri=uri))
     line = caught.value.line()
-    assert line.startswith(f"tracking.uri {shown(uri)}: does not answer (Connection refused)")
+    assert line.startswith(f"tracking.uri {hide_credentials(uri)}: does not answer (Connection refused)")
     assert "\n" not in line
     assert "secret" not in line
     with pytest.raises(UserError, match="does not answer"):

@@ -21,7 +21,7 @@ from sceneexpander.viewer.viser_axes import (
     viser_camera,
     viser_picture,
     viser_splats,
-    widened,
+    widen_gaussians,
 )
 from tests.worlds.row_of_views import HEIGHT, WIDTH, reconstruction
 
@@ -96,7 +96,7 @@ def test_narrow_gaussians_are_widened_in_the_view_that_made_them() -> None:
     scene = reconstruction("captured", [0.0, 0.4])
     flat = torch.tensor([[0.01, 0.001, 0.3], [0.5, 0.4, 0.002]])
     gaussians = replace(scene.gaussians.select(torch.arange(2)), scales=flat)
-    found = widened(gaussians, ShownCameras.of(scene)).scales
+    found = widen_gaussians(gaussians, ShownCameras.of(scene)).scales
     least = LEAST_STD_PX * 2.0 / 25.0  # depth 2, focal length 25
     expected = torch.tensor([[least, 0.001, 0.3], [0.5, 0.4, 0.002]])
     torch.testing.assert_close(found, expected)

@@ -13,7 +13,7 @@ from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.depth_files import DepthFile, depth_file
 from sceneexpander.ingest.jsonfile import read_user_json
 from sceneexpander.ingest.lens_models import Lens
-from sceneexpander.ingest.sources.capture import Capture, Shot, named, number_array, rigid_pose
+from sceneexpander.ingest.sources.capture import Capture, Shot, name_some, number_array, rigid_pose
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.survey import MASKS_FOLDER, list_pictures, natural_key
 from sceneexpander.plainfiles import read_plain_file
@@ -39,18 +39,23 @@ class SevenScenes:
         return place.is_dir() and any(_pose_file(path).is_file() for path in _colour_frames(place))
 
     def read(self, place: Path, config: IngestConfig) -> Capture:
-        """All frames; some may have no pose."""
-        shots, files = [], []
+        """All frames; some may have no pose. Recordings of this form write numbers that are not finite where tracking was lost."""
+        shots, files, lost = [], [], []
         for path in _colour_frames(place):
             pose_file = _pose_file(path)
             pose = None
             if pose_file.is_file():
-                pose = rigid_pose(_numbers(pose_file, (12, 16)).reshape(-1, 4), pose_file)
+                values = _numbers(pose_file, (12, 16), finite=False)
+                if np.isfinite(values).all():
+                    pose = rigid_pose(values.reshape(-1, 4), pose_file)
+                else:
+                    lost.append(path.name)
                 files.append(pose_file)
             shots.append(Shot(name=path.name, picture=path, world_from_cam=pose))
         if not shots:
             raise UserError("holds no frame-XXXXXX.color.png", where=place)
-        return Capture(shots=tuple(shots), files=tuple(files), metric=True, chosen=True)
+        notes = (f"frames whose pose is not finite are taken without one: {name_some(lost)}",) if lost else ()
+        return Capture(shots=tuple(shots), notes=notes, files=tuple(files), metric=True, chosen=True)
 
 
 def _colour_frames(place: Path) -> list[Path]:
@@ -94,7 +99,9 @@ class CameraTexts:
                 )
             )
         notes = (
-            (f"cameras of pictures that are not there: {named([printable(name) for name in known])}",) if known else ()
+            (f"cameras of pictures that are not there: {name_some([printable(name) for name in known])}",)
+            if known
+            else ()
         )
         return Capture(shots=tuple(shots), notes=notes, files=tuple(files), chosen=True)
 
@@ -171,11 +178,12 @@ def _depth_of(stem: str, place: Path, folders: tuple[str, ...]) -> DepthFile | N
     return None
 
 
-def _numbers(path: Path, counts: tuple[int, ...]) -> np.ndarray:
-    """All numbers of a small text file. Raises `UserError` unless it holds as many of them as one of ``counts``."""
+def _numbers(path: Path, counts: tuple[int, ...], *, finite: bool = True) -> np.ndarray:
+    """All numbers of a small text file. Raises `UserError` unless it holds as many of them as one of ``counts``, and ``finite`` ones."""
     try:
         words = read_plain_file(path, limit_bytes=_LIMIT_BYTES).decode().split()
-        values = number_array([float(word) for word in words], path)
+        numbers = [float(word) for word in words]
+        values = number_array(numbers, path) if finite else np.asarray(numbers)
     except ValueError:
         raise UserError("holds something else where a number is expected", where=path) from None
     if values.size not in counts:

@@ -158,7 +158,7 @@ def member(folder: Path, name: str, where: str | Path) -> Path:
     return folder.joinpath(*parts)
 
 
-def named(names: Sequence[str]) -> str:
+def name_some(names: Sequence[str]) -> str:
     """A few of the names, for one line."""
     rest = len(names) - _MOST_NAMED
     return ", ".join(names[:_MOST_NAMED]) + (f" and {rest} more" if rest > 0 else "")

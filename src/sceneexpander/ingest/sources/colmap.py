@@ -17,7 +17,7 @@ from sceneexpander.errors import UserError, printable
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.depth_files import DepthFile, DepthFormat
 from sceneexpander.ingest.lens_models import Lens, Projection
-from sceneexpander.ingest.sources.capture import Capture, Shot, member, named, number_array, rigid_pose
+from sceneexpander.ingest.sources.capture import Capture, Shot, member, name_some, number_array, rigid_pose
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.survey import MASKS_FOLDER, natural_key
 from sceneexpander.plainfiles import read_plain_file
@@ -100,12 +100,16 @@ class ColmapModel:
 
     def detect(self, place: Path) -> bool:
         """Whether there is a model in one of the usual folders."""
-        return place.is_dir() and bool(_model_folders(place))
+        return place.is_dir() and (bool(_model_folders(place)) or _lone_part(place) is not None)
 
     def read(self, place: Path, config: IngestConfig) -> Capture:
         """The pictures that the model has cameras of."""
         folders = _model_folders(place)
         if not folders:
+            lone = _lone_part(place)
+            if lone is not None:
+                problem = "is one part of a model, whose other one (cameras or images, text or binary) is not beside it"
+                raise UserError(problem, where=lone, fix="put both there")
             places = ", ".join(_MODEL_FOLDERS)
             raise UserError("holds no COLMAP model", where=place, fix=f"cameras and images are looked for in: {places}")
         folder, pictures, images = _best(place, folders)
@@ -142,12 +146,12 @@ class ColmapModel:
                 )
             )
         if not shots:
-            raise UserError(f"lists {named(missing)}, none of which is there", where=images_file, fix="add images/")
+            raise UserError(f"lists {name_some(missing)}, none of which is there", where=images_file, fix="add images/")
         notes = []
         if missing:
-            notes.append(f"{len(missing)} of {len(images)} pictures of the model are not there: {named(missing)}")
+            notes.append(f"{len(missing)} of {len(images)} pictures of the model are not there: {name_some(missing)}")
         if len(folders) > 1 and not eth3d:
-            others = named([other.relative_to(place).as_posix() for other in folders if other != folder])
+            others = name_some([other.relative_to(place).as_posix() for other in folders if other != folder])
             notes.append(f"the model in {folder.relative_to(place).as_posix()} is used; there is also {others}")
         if eth3d and (place / _ETH3D_DEPTH).is_dir() and not any(shot.depth for shot in shots):
             notes.append(
@@ -162,6 +166,16 @@ def _ending(folder: Path) -> str | None:
     for ending in ("bin", "txt"):
         if all((folder / f"{part}.{ending}").is_file() for part in ("cameras", "images")):
             return ending
+    return None
+
+
+def _lone_part(place: Path) -> Path | None:
+    """A file of a model that lacks its other one; looked for where only models are."""
+    for name in _MODEL_FOLDERS:
+        if "sparse" in PurePosixPath(name).parts:
+            for part in ("cameras.bin", "images.bin", "cameras.txt", "images.txt"):
+                if (place / name / part).is_file():
+                    return place / name / part
     return None
 
 

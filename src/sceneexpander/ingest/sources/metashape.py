@@ -17,7 +17,7 @@ from jaxtyping import Float
 from sceneexpander.errors import UserError, printable
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.ingest.lens_models import Lens
-from sceneexpander.ingest.sources.capture import Capture, Shot, named, rigid_pose
+from sceneexpander.ingest.sources.capture import Capture, Shot, name_some, rigid_pose
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.survey import MASKS_FOLDER, list_pictures, natural_key
 from sceneexpander.ingest.xmlfile import numbers_of, read_user_xml
@@ -60,7 +60,7 @@ class MetashapeCameras:
                 )
             )
         left = [printable(label) for label in sorted(cameras, key=natural_key)]
-        notes = [f"cameras of pictures that are not there: {named(left)}"] if left else []
+        notes = [f"cameras of pictures that are not there: {name_some(left)}"] if left else []
         if world is not None and world.moved:
             notes.append(f"{path.name}: is placed on the Earth; the axes are kept, the origin is the chunk's own")
         return Capture(shots=tuple(shots), notes=tuple(notes), files=(path,), metric=world is not None, chosen=True)

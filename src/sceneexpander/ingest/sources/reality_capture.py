@@ -92,9 +92,6 @@ def _pose(facts: dict[str, str], path: Path) -> Float[np.ndarray, "4 4"] | None:
 def _lens(facts: dict[str, str], size: tuple[int, int], path: Path) -> Lens | None:
     if "FocalLength35mm" not in facts:
         return None
-    side = float(max(size))
-    focal = _number(facts, "FocalLength35mm", path, 0.0) / _FRAME_MM * side
-    centre = [_number(facts, f"PrincipalPoint{axis}", path, 0.0) * side for axis in "UV"]
     if _number(facts, "Skew", path, 0.0) != 0 or _number(facts, "AspectRatio", path, 1.0) != 1:
         raise UserError(
             "has pixels that are no squares, which is not read here", where=path, fix="export undistorted pictures"
@@ -110,13 +107,39 @@ def _lens(facts: dict[str, str], size: tuple[int, int], path: Path) -> Lens | No
                 fix = "register with the model Brown3, or export undistorted pictures"
                 raise UserError(problem, where=path, fix=fix)
             radial = values[:3]
+    centre = tuple(_number(facts, f"PrincipalPoint{axis}", path, 0.0) for axis in "UV")
     k1, k2, k3 = (float(value) for value in radial)
+    return make_lens(_number(facts, "FocalLength35mm", path, 0.0), (centre[0], centre[1]), (k1, k2, k3), size, path)
+
+
+def make_lens(
+    focal_mm: float,
+    centre: tuple[float, float],
+    radial: tuple[float, float, float],
+    size: tuple[int, int],
+    where: str | Path,
+) -> Lens:
+    """A camera in the vendor's units.
+
+    Args:
+        focal_mm: of a frame whose longer side is 36 mm.
+        centre: principal point from the picture's middle, in units of the longer side.
+        radial: k1, k2, k3.
+        size: (height, width) of the picture.
+        where: what error messages name.
+
+    Raises:
+        UserError: no camera has these values.
+    """
+    side = float(max(size))
+    focal = focal_mm / _FRAME_MM * side
+    k1, k2, k3 = radial
     try:
         return Lens(
             focal_px=(focal, focal),
-            centre_px=(size[1] / 2 + centre[0], size[0] / 2 + centre[1]),
+            centre_px=(size[1] / 2 + centre[0] * side, size[0] / 2 + centre[1] * side),
             size=size,
-            distortion=(k1, k2, 0.0, 0.0, k3) if radial.any() else (),
+            distortion=(k1, k2, 0.0, 0.0, k3) if any(radial) else (),
         )
     except UserError as error:
-        raise UserError(f"has a camera that {error.problem}", where=path) from None
+        raise UserError(f"has a camera that {error.problem}", where=where) from None

@@ -19,7 +19,7 @@ from sceneexpander.ingest.depth_files import depth_file
 from sceneexpander.ingest.formats import PICTURE_EXTENSIONS
 from sceneexpander.ingest.jsonfile import number_at, read_user_json, text_at
 from sceneexpander.ingest.lens_models import Lens, Projection
-from sceneexpander.ingest.sources.capture import Capture, Shot, member, named, number_array, rigid_pose
+from sceneexpander.ingest.sources.capture import Capture, Shot, member, name_some, number_array, rigid_pose
 from sceneexpander.ingest.survey import natural_key
 from sceneexpander.typed import shorten
 
@@ -67,9 +67,9 @@ class Transforms:
                 continue
             shots.append(_shot(content, frame, picture, name, axes, config, path.parent, where))
         if not shots:
-            raise UserError(f"lists {named(missing)}, none of which is there", where=path)
+            raise UserError(f"lists {name_some(missing)}, none of which is there", where=path)
         shots.sort(key=lambda shot: natural_key(shot.name))
-        notes = [f"{len(missing)} of {len(frames)} pictures are not there: {named(missing)}"] if missing else []
+        notes = [f"{len(missing)} of {len(frames)} pictures are not there: {name_some(missing)}"] if missing else []
         return Capture(shots=tuple(shots), notes=tuple(notes), files=(path,), chosen=True)
 
 

@@ -22,7 +22,7 @@ from sceneexpander.ingest.sources.capture import Capture, Shot
 from sceneexpander.plainfiles import require_plain_file
 
 _ENDINGS = frozenset(
-    {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp", ".flv"}
+    {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp", ".flv", ".gif"}
 )
 _MOST_FRAMES = 1_000_000
 _PQ, _HLG = 16, 18  # transfer characteristics of ITU-T H.273
@@ -33,7 +33,7 @@ _SRGB_FROM_BT2020 = np.array(
 
 
 class Video:
-    """One video file."""
+    """One video file; animated GIFs are some."""
 
     title = "a video"
 
@@ -49,7 +49,8 @@ class Video:
         try:
             return _read(place, config)
         except (av.error.FFmpegError, ValueError, EOFError, OSError, MemoryError, IndexError) as error:
-            reason = " ".join(str(error).split())[:80]
+            # FFmpeg's own errors repeat the name of the file, and an errno that says nothing.
+            reason = " ".join((getattr(error, "strerror", None) or str(error)).split())[:80]
             raise UserError(
                 f"cannot be read as a video ({reason})", where=place, fix="convert it to MP4 (H.264)"
             ) from None

@@ -81,7 +81,7 @@ def _provenance(
     return heaviest, weights.new_zeros(count).index_add(0, group, signed) > 0
 
 
-def unmerged(
+def leave_unmerged(
     pixels: PixelGaussians,
     batch_index: int,
     *,

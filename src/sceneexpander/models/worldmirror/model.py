@@ -35,7 +35,7 @@ from sceneexpander.models.worldmirror.gaussians import (
     unproject_integer_pixels,
 )
 from sceneexpander.models.worldmirror.init import initialise
-from sceneexpander.models.worldmirror.merge import merge_voxels, unmerged
+from sceneexpander.models.worldmirror.merge import leave_unmerged, merge_voxels
 from sceneexpander.models.worldmirror.priors import BatchPriors, NormalisedPriors, normalise_priors
 from sceneexpander.models.worldmirror.transformer import VisualGeometryTransformer
 
@@ -214,7 +214,7 @@ class WorldMirror(BackboneModel):
         merged = [
             merge_voxels(pixels, b, voxel_size=config.voxel_size, source_view=source[b], generated=by_generation[b])
             if config.merge
-            else unmerged(pixels, b, source_view=source[b], generated=by_generation[b])
+            else leave_unmerged(pixels, b, source_view=source[b], generated=by_generation[b])
             for b in range(batch)
         ]
         made, left = conf[0].numel(), pixels.means.shape[1]

@@ -13,11 +13,11 @@ from unittest.mock import patch
 
 import pytest
 
-from sceneexpander import sweep as module
 from sceneexpander.artifacts.store import to_plain, write_json_atomic
-from sceneexpander.sweep import Job, Sweep, job_state, run_sweep
+from sceneexpander.cli import sweep as module
+from sceneexpander.cli.sweep import Job, Sweep, job_state, run_sweep
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PIPELINE = """
 stages:
   common:

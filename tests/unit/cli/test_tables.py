@@ -12,8 +12,8 @@ import pytest
 from sceneexpander.artifacts.judgement import Answered, JudgedRound, MethodScore, ScoreSample
 from sceneexpander.artifacts.metrics import MetricsRow, UnavailableRow
 from sceneexpander.catalogue.paper import ABLATION, COMPARISON
+from sceneexpander.cli.tables import ablation, comparison, read_runs, write_table
 from sceneexpander.errors import UserError
-from sceneexpander.tables import ablation, comparison, read_runs, write_table
 
 ROW = MetricsRow(
     scene="yard",

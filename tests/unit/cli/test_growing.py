@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 import yaml
 
-from sceneexpander import expand as command
-from sceneexpander import growing
 from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.metrics import MetricsRow, ViewMetrics
+from sceneexpander.cli import expand as command
+from sceneexpander.cli import growing
+from sceneexpander.cli.expand import expand, parse_arguments, read_arguments
+from sceneexpander.cli.growing import RoundRequest, add_round, proposal_lines, quality_line, undo_round
 from sceneexpander.errors import UserError
-from sceneexpander.expand import expand, parse_arguments, read_arguments
 from sceneexpander.generation import Forecast
-from sceneexpander.growing import RoundRequest, add_round, proposal_lines, quality_line, undo_round
 from sceneexpander.pipeline.preflight import CheckedScene
 from sceneexpander.pipeline.selection import read_selection
 from tests.worlds.expansions import everything, photos, picture, project, request, somebody_at_work

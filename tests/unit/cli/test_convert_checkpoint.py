@@ -18,7 +18,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from sceneexpander.convert_checkpoint import ALLOWED, convert, main, read_checkpoint
+from sceneexpander.cli.convert_checkpoint import ALLOWED, convert, main, read_checkpoint
 from sceneexpander.errors import UserError
 
 

@@ -3,7 +3,7 @@
 ``PHOTOS`` is a folder of photos, a scene folder with a ``scene.yaml``, a video, a COLMAP model, a ``transforms.json``, what else
 `sceneexpander.ingest.sources` reads, or a ZIP archive of any of these. The picture beyond their boundary is your own (``--inserted``),
 or made from the words (``--generator``). Runs in ``runs/NAME`` and prints where the report is. Methods and settings are those of the
-project's params.yaml; ``key=value`` adds to them. ``--continue NAME`` goes on from a finished run, see `sceneexpander.growing`.
+project's params.yaml; ``key=value`` adds to them. ``--continue NAME`` goes on from a finished run, see `sceneexpander.cli.growing`.
 """
 
 from __future__ import annotations
@@ -11,12 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import shutil
 import sys
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,18 +21,30 @@ from typing import Any
 import yaml
 
 from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.cli import growing
+from sceneexpander.cli.run_folder import (
+    NO_PICTURE,
+    SCENE_FILE,
+    SOURCE_FILE,
+    agree_to_requests,
+    announce_forecasts,
+    inserted_name,
+    scratch_folder,
+    shown_as_given,
+)
 from sceneexpander.commandline import CommandParser
 from sceneexpander.config.compose import compose
 from sceneexpander.config.parse import parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.errors import UserError, entry_point, printable
 from sceneexpander.files import write_bytes_atomic
-from sceneexpander.generation import Forecast, backend_of
+from sceneexpander.generation import backend_of
 from sceneexpander.ingest import IngestConfig, make_round, read_picture, safe_name, scene_files
 from sceneexpander.ingest.archives import is_archive, unpack_archive
 from sceneexpander.ingest.sources import read_capture
+from sceneexpander.ingest.sources.capture import name_some
 from sceneexpander.ingest.sources.posed import write_posed_photos
-from sceneexpander.pipeline.disk import remove_tree
+from sceneexpander.ingest.survey import NoPicturesError, natural_key
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import check_scene
 from sceneexpander.pipeline.processes import ended_by_signals
@@ -45,9 +54,6 @@ from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, r
 from sceneexpander.plainfiles import require_plain_file
 from sceneexpander.report.cameras import camera_lines
 
-NO_PICTURE = "give one --inserted PICTURE for each round, or have them made: --generator reproject, openai, ..."
-SCENE_FILE = "scene.yaml"
-SOURCE_FILE = "source.json"  # in a run's folder: which photos it is of
 UNPACKED = ".unpacked"  # while a run is put together: what an archive holds
 
 
@@ -211,7 +217,11 @@ def stage_scene(
         for k in range(max(count, 1))
     ]
     ingest = IngestConfig() if ingest is None else ingest
-    capture = read_capture(photos, ingest)
+    try:
+        capture = read_capture(photos, ingest)
+    except NoPicturesError:
+        _refuse_several_scenes(photos)
+        raise
     if any(shot.calibrated or shot.mask or shot.depth or isinstance(shot.picture, bytes) for shot in capture.shots):
         write_posed_photos(capture, target / "captured", ingest)
     else:
@@ -238,13 +248,14 @@ def stage_scene(
     (target / SCENE_FILE).write_text(text, encoding="utf-8")
 
 
-def inserted_name(number: int, source: Path) -> Path:
-    """Where the picture of a round lies in a scene folder.
-
-    The content decides what it is: an ending is for people, and may be as odd or long as the whole name.
-    """
-    ending = source.suffix.lower() if re.fullmatch(r"\.[A-Za-z0-9]{1,8}", source.suffix) else ""
-    return Path("inserted") / f"round_{number}{ending}"
+def _refuse_several_scenes(folder: Path) -> None:
+    """Raise `UserError` if the folder is one of scene folders, as a project's ``scenes/`` is."""
+    names = sorted((path.parent.name for path in folder.glob(f"*/{SCENE_FILE}")), key=natural_key)
+    if names:
+        fix = f"expand one of them, or name them in 'scenes:' of the {PARAMS} beside a folder scenes/, and 'sceneexpander run'"
+        raise UserError(
+            f"is a folder of scene folders ({name_some([printable(name) for name in names])})", where=folder, fix=fix
+        )
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -325,18 +336,6 @@ def _check_words(request: Request) -> None:
             raise UserError("holds a byte that is not valid text", where=option, fix="write it in UTF-8")
 
 
-@contextmanager
-def scratch_folder(folder: Path) -> Iterator[Path]:
-    """A folder on the run's disk, so that what is put together there need not be copied again. Earlier ones of killed runs go."""
-    for left in folder.parent.glob(f".{folder.name}.*.part"):
-        remove_tree(left)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
-    try:
-        yield scratch
-    finally:
-        remove_tree(scratch)
-
-
 def expand(request: Request, *, project: Path) -> Path | None:
     """Check the request, run the pipeline in ``runs/NAME`` and return the report page; of a dry run None.
 
@@ -380,39 +379,6 @@ def expand(request: Request, *, project: Path) -> Path | None:
     return folder / "outputs" / "report" / "index.html"
 
 
-def announce_forecasts(forecasts: Sequence[Forecast], backend: str, *, details: bool, first: int = 1) -> None:
-    """Print what a run would ask of a generator for rounds from ``first`` on; without ``details`` only what a user must know."""
-    for number, forecast in enumerate(forecasts, start=first):
-        if details:
-            print(f"round {number}: generator {backend}")
-            print(f"  prompt: {printable(forecast.prompt)}")
-            print(f"  requests: {forecast.requests}, {_cost_words(forecast.cost_usd)}")
-        for note in (*forecast.notes, *forecast.warnings) if details else forecast.warnings:
-            print(f"  {printable(note)}" if details else f"round {number}: {printable(note)}")
-
-
-def _cost_words(cost_usd: float | None) -> str:
-    return "price not known (generator.price_usd)" if cost_usd is None else f"about {cost_usd:.2f} USD"
-
-
-def agree_to_requests(forecasts: Sequence[Forecast], *, unattended: bool) -> None:
-    """Ask before anything is sent that may cost something.
-
-    Raises:
-        UserError: the user does not want it, or there is nobody to ask.
-    """
-    costs = [forecast.cost_usd for forecast in forecasts if forecast.requests]
-    requests = sum(forecast.requests for forecast in forecasts)
-    if unattended or all(cost == 0 for cost in costs):
-        return
-    total = None if any(cost is None for cost in costs) else sum(cost or 0.0 for cost in costs)
-    what = f"{requests} request{'s' * (requests != 1)} to paid services, {_cost_words(total)}"
-    if not sys.stdin.isatty():
-        raise UserError(f"would send {what}", where="expand", fix="add --yes to send them without asking")
-    if input(f"{what}. Send? [y/N] ").strip().casefold() not in ("y", "yes"):
-        raise UserError("nothing was sent", where="expand", fix="--dry-run shows what would be")
-
-
 def choice_lines(folder: Path, name: str, rounds: int) -> list[str]:
     """What became of the candidates of a finished run, where there were several, and how to take another."""
     lines = []
@@ -436,24 +402,9 @@ def _originals(scene: Path, request: Request) -> dict[Path, Path]:
     return {**pictures, scene / "captured": request.photos, scene: request.photos}
 
 
-@contextmanager
-def shown_as_given(originals: Mapping[Path, Path]) -> Iterator[None]:
-    """Errors about a copy name the file that it was copied from. ``originals`` by copy, what lies inside others first."""
-    try:
-        yield
-    except UserError as error:
-        where, problem = error.where or "", error.problem
-        for copy, original in originals.items():
-            where, problem = where.replace(str(copy), str(original)), problem.replace(str(copy), str(original))
-        raise UserError(problem, where=where or None, fix=error.fix) from None
-
-
 @entry_point
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    # It builds on this module.
-    from sceneexpander import growing
-
     given = read_arguments(sys.argv[1:] if arguments is None else arguments)
     project = find_project()
     if given.propose:

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from sceneexpander import ablation, sweep, ui
 from sceneexpander.artifacts.store import to_plain, write_json_atomic
+from sceneexpander.cli import ablation, sweep, ui
+from sceneexpander.cli.sweep import check_axes, run_hydra
 from sceneexpander.errors import UserError
 from sceneexpander.expandbench.run import CellResult, Plan, Settings
 from sceneexpander.pipeline.selection import Selection
-from sceneexpander.sweep import check_axes, run_hydra
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(autouse=True)

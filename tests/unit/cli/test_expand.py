@@ -12,6 +12,7 @@ import stat
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,16 +20,17 @@ from typing import Any
 import pytest
 import yaml
 
-from sceneexpander import expand as command
 from sceneexpander.artifacts.cameras import CameraReport, ViewCamera
 from sceneexpander.artifacts.page import BaseModel, ScenePage
+from sceneexpander.cli import expand as command
+from sceneexpander.cli.expand import Request, expand, run_name, stage_scene
 from sceneexpander.errors import UserError, printable
-from sceneexpander.expand import Request, expand, run_name, stage_scene
 from sceneexpander.generation import Forecast
 from sceneexpander.pipeline import preflight
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import CheckedScene
 from sceneexpander.pipeline.selection import read_selection
+from tests.worlds.captures import MAKERS
 from tests.worlds.expansions import ROOT, everything, photos, picture, project, request, somebody_at_work
 
 __all__ = ["project"]  # the fixture
@@ -81,6 +83,29 @@ def test_what_is_wrong_in_an_archive_is_named_by_the_archive(
         expand(given, project=project)
     assert caught.value.where == str(tmp_path / f"{name}.zip" / place)
     assert not (project / "runs" / name / "source.json").exists()
+
+
+def test_a_folder_of_scene_folders_is_told_where_they_belong(project: Path, tmp_path: Path) -> None:
+    for name in ("scene_2", "scene_10", "scene_1"):
+        scene(tmp_path / "many" / name)
+    with pytest.raises(UserError) as caught:
+        expand(request(tmp_path / "many", tmp_path), project=project)
+    line = caught.value.line()
+    assert f"{tmp_path / 'many'}: is a folder of scene folders (scene_1, scene_2, scene_10)" in line
+    assert "'scenes:' of the params.yaml" in line
+    assert not (project / "runs" / "many").exists()
+
+
+@pytest.mark.parametrize("made", [MAKERS["colmap"], MAKERS["transforms"]])
+def test_a_folder_of_captures_names_the_captures_and_not_their_pictures(
+    project: Path, tmp_path: Path, made: Callable[[Path], None]
+) -> None:
+    for name in ("a", "b"):
+        (tmp_path / "many" / name).mkdir(parents=True)
+        made(tmp_path / "many" / name)
+    with pytest.raises(UserError, match=r"captures in folders of their own: a \(.*\), b \(.*\); pass one") as caught:
+        expand(request(tmp_path / "many", tmp_path), project=project)
+    assert "images" not in caught.value.line()
 
 
 @pytest.mark.parametrize(("one", "two"), [("写真", "台所"), ("a b", "a_b"), ("Küche", "Kuche"), ("x" * 60, "x" * 70)])

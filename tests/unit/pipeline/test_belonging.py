@@ -23,7 +23,7 @@ from stages import layout, runner
 from stages.fingerprint import stage_names
 from stages.resolve import link_files, named_files
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SCENE = "room"
 SECTIONS = (
     "seed",

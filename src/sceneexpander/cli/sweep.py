@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 INNER_ENV = "SCENEEXPANDER_SWEEP_RUNS"  # in the process that runs Hydra, which ends with the one that the user sees: the sweep's folder
 # Not as a program of its own: launchers send the jobs' classes to other processes by the name of their module, which must not be __main__.
-_INNER = "from sceneexpander.sweep import main; main()"
+_INNER = "from sceneexpander.cli.sweep import main; main()"
 SCENE_KEY = "scene"  # the axis: folders of scenes/, while Hydra's group of this name holds settings
 _JOB_KEY = "+swept_job"  # the one axis that Hydra gets: numbers of jobs, so that any of them can be started again
 SWEEP_FILE, STATE_FILE = "sweep.json", "job.json"  # in the folders of a sweep and of a job

@@ -180,7 +180,7 @@ def _place(given: argparse.Namespace) -> None:
 
 
 def _rows(given: argparse.Namespace, *, shrink: int) -> Rows:
-    from sceneexpander.ablation import code_of, make_plan
+    from sceneexpander.cli.ablation import code_of, make_plan
     from sceneexpander.expandbench.leaderboard import Rows, own_rows
     from sceneexpander.expandbench.run import Settings
     from sceneexpander.expandbench.scenes import DEVELOPMENT

@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command = [sys.executable, "-m", "mlflow", "ui", "--host", HOST, "--port", str(port)]
     command += ["--backend-store-uri", tracking_uri(TrackingConfig(), root)]
     environment = without_foreign_settings(os.environ)
-    follow = [sys.executable, "-m", "sceneexpander.follow"]
+    follow = [sys.executable, "-m", "sceneexpander.cli.follow"]
     try:
         with (
             ended_by_signals(),

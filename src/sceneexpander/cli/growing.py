@@ -24,13 +24,7 @@ from sceneexpander.artifacts.proposals import Proposals
 from sceneexpander.artifacts.store import ArtifactError
 from sceneexpander.catalogue import MAIN
 from sceneexpander.catalogue.methods import CAPTURED
-from sceneexpander.config.compose import compose
-from sceneexpander.config.overrides import written_out
-from sceneexpander.config.parse import parse_dataclass
-from sceneexpander.config.schema import ProjectConfig
-from sceneexpander.errors import UserError, did_you_mean
-from sceneexpander.evaluation.quality import find_failures
-from sceneexpander.expand import (
+from sceneexpander.cli.run_folder import (
     NO_PICTURE,
     SCENE_FILE,
     SOURCE_FILE,
@@ -40,6 +34,12 @@ from sceneexpander.expand import (
     scratch_folder,
     shown_as_given,
 )
+from sceneexpander.config.compose import compose
+from sceneexpander.config.overrides import written_out
+from sceneexpander.config.parse import parse_dataclass
+from sceneexpander.config.schema import ProjectConfig
+from sceneexpander.errors import UserError, did_you_mean
+from sceneexpander.evaluation.quality import find_failures
 from sceneexpander.files import write_bytes_atomic
 from sceneexpander.generation import backend_of
 from sceneexpander.ingest import make_round, read_picture

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from sceneexpander.cli.expand import parse_arguments, stage_scene
 from sceneexpander.errors import UserError
-from sceneexpander.expand import parse_arguments, stage_scene
 from sceneexpander.ingest import load_scene
 from sceneexpander.ingest.config import IngestConfig
 from sceneexpander.pipeline.preflight import check_scene
 from tests.worlds.photos import photos, texture
 
 pytestmark = pytest.mark.timeout(60)
-CONF = Path(__file__).parents[2] / "conf"
+CONF = Path(__file__).parents[3] / "conf"
 
 
 def refusal(root: Path, *arguments: str) -> str:

@@ -27,7 +27,9 @@ from sceneexpander.plainfiles import require_folder
 
 if TYPE_CHECKING:
     from sceneexpander.artifacts.judgement import JudgedRound
-    from sceneexpander.judge import ChatJudgeConfig, Judge, Work
+    from sceneexpander.judge.ask import Judge
+    from sceneexpander.judge.config import ChatJudgeConfig
+    from sceneexpander.judge.rounds import Work
 
 _BACKEND = "judge=openai"
 
@@ -82,7 +84,8 @@ def judge_run(request: Request, *, project: Path) -> list[JudgedRound] | None:
     Raises:
         UserError: nothing was rendered there, the judge cannot be asked, or the user does not want it.
     """
-    from sceneexpander.judge import judge_round, make_judge
+    from sceneexpander.judge.ask import make_judge
+    from sceneexpander.judge.rounds import judge_round
 
     config = judge_config(request.overrides, project=project)
     require_folder(request.run, expected="the folder of a run")
@@ -115,7 +118,7 @@ def judge_run(request: Request, *, project: Path) -> list[JudgedRound] | None:
 
 def judge_config(overrides: Sequence[str], *, project: Path) -> ChatJudgeConfig:
     """The section ``judge`` of the configuration with these overrides; OpenAI's protocol unless they say otherwise."""
-    from sceneexpander.judge import ChatJudgeConfig
+    from sceneexpander.judge.config import ChatJudgeConfig
 
     named = any(key_of(item) == "judge" for item in overrides)
     items = written_out([*([] if named else [_BACKEND]), *overrides], absolute=True)
