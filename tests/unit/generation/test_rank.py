@@ -13,7 +13,7 @@ from sceneexpander.generation import SceneSoFar
 from sceneexpander.generation.assess import frame_of
 from sceneexpander.generation.rank import rank_candidates
 from sceneexpander.ingest.fit import FittedPicture, fit_picture
-from tests.worlds.painted_wall import HEIGHT, WIDTH, blobs, tensor, view_of_wall
+from tests.worlds.painted_wall import HEIGHT, WALL, WIDTH, blobs, tensor, view_of_wall
 from tests.worlds.rounds import flat_scene, made_views
 
 
@@ -55,6 +55,19 @@ def test_more_of_the_place_beats_a_repetition(
 ) -> None:
     ranking = rank_candidates([fitted(view_of_wall(2.0)), fitted(view_of_wall(90.0))], so_far, seed=0)
     assert ranking[0].candidate == 1
+
+
+@pytest.mark.parametrize("stretch", [-0.08, 0.08])
+def test_of_pictures_alike_but_for_a_stretch_the_other_one_is_first(
+    so_far: SceneSoFar, fitted: Callable[[np.ndarray], FittedPicture], stretch: float
+) -> None:
+    width = 2 * WIDTH / (1 + stretch)
+    left, top = (3 * WIDTH - width) / 2 + 30, HEIGHT / 2
+    frame = left, top, left + width, top + 2 * HEIGHT
+    stretched = Image.fromarray(WALL).resize((2 * WIDTH, 2 * HEIGHT), Image.Resampling.BICUBIC, box=frame)
+    ranking = rank_candidates([fitted(np.asarray(stretched)), fitted(view_of_wall(30.0))], so_far, seed=0)
+    assert ranking[0].candidate == 1
+    assert ranking[0].total > ranking[1].total + 0.1, "not by chance"
 
 
 def test_another_focal_length_is_no_disagreement(
