@@ -13,6 +13,7 @@ import platform
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -111,8 +112,12 @@ def make_plan(
 
 
 def _composed(project: Path, overrides: Sequence[str], experiment: str = "expandbench") -> ProjectConfig:
-    values = compose(project / "conf", [f"experiment={experiment}", *overrides])
-    return parse_dataclass(ProjectConfig, values)
+    return _composed_from((project / "conf").resolve(), (f"experiment={experiment}", *overrides))
+
+
+@cache  # studies have rows in common
+def _composed_from(folder: Path, overrides: tuple[str, ...]) -> ProjectConfig:
+    return parse_dataclass(ProjectConfig, compose(folder, list(overrides)))
 
 
 def code_of(project: Path, module: str = "sceneexpander.expandbench.run") -> str:

@@ -105,6 +105,7 @@ def test_a_phone_held_level_and_turned_is_one_camera(tmp_path: Path) -> None:
     assert [made.focal_px(view) for view in range(5)] == pytest.approx([FOCAL_PX] * 5, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_cropped_photo_gets_its_centre_or_is_named(tmp_path: Path) -> None:
     def cut(picture: Image.Image, number: int) -> Image.Image:
         return picture.crop((0, 0, int(picture.width * 0.7), int(picture.height * 0.7))) if number == 4 else picture
