@@ -23,6 +23,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sceneexpander.evaluation.image import check_comparable
+
 PACKAGE = "pycvvdp"
 _DISPLAY = "standard_4k"
 _log = logging.getLogger(__name__)
@@ -52,10 +54,7 @@ def cvvdp(image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 he
     Raises:
         ValueError: shapes differ, or values are not finite.
     """
-    if image.shape != reference.shape:
-        raise ValueError(f"cannot compare images of {tuple(image.shape)} and {tuple(reference.shape)}")
-    if not bool(torch.isfinite(image).all() and torch.isfinite(reference).all()):
-        raise ValueError("cannot compare images that hold non-finite values")
+    check_comparable(image, reference)
     metric = _metric()
     if metric is None:
         return None

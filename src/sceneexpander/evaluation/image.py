@@ -137,12 +137,17 @@ def _scattered(plane: Tensor, weights: list[float]) -> Tensor:
     return plane
 
 
-def _checked(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+def check_comparable(image: Tensor, reference: Tensor) -> None:
+    """Raise ValueError unless both are pictures (3, height, width) of one size that hold finite values."""
     if image.shape != reference.shape or image.ndim != 3:
         raise ValueError(f"cannot compare images of {tuple(image.shape)} and {tuple(reference.shape)}")
-    a, b = image.detach().double(), reference.detach().double()
-    if not (torch.isfinite(a).all() and torch.isfinite(b).all()):
+    if not bool(torch.isfinite(image).all() and torch.isfinite(reference).all()):
         raise ValueError("cannot compare images that hold non-finite values")
+
+
+def _checked(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+    check_comparable(image, reference)
+    a, b = image.detach().double(), reference.detach().double()
     return a.clamp(0, 1), b.clamp(0, 1)
 
 

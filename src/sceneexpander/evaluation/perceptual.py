@@ -24,6 +24,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from sceneexpander.evaluation.image import check_comparable
+
 PACKAGE = "stlpips_pytorch"
 _WEIGHTS = "weights/vST0.0/alex_shift_tolerant.pth"
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -48,10 +50,7 @@ def st_lpips(image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3
     Raises:
         ValueError: shapes differ, or values are not finite.
     """
-    if image.shape != reference.shape:
-        raise ValueError(f"cannot compare images of {tuple(image.shape)} and {tuple(reference.shape)}")
-    if not bool(torch.isfinite(image).all() and torch.isfinite(reference).all()):
-        raise ValueError("cannot compare images that hold non-finite values")
+    check_comparable(image, reference)
     network = _network()
     if network is None:
         return None

@@ -30,6 +30,7 @@ from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.cvvdp import cvvdp
+from sceneexpander.evaluation.image import check_comparable
 from sceneexpander.evaluation.measure import Measure, SeenView, UnseenView, Values
 from sceneexpander.plainfiles import require_plain_file
 
@@ -152,12 +153,8 @@ def flip_map(
 
 
 def _pair(image: Tensor, reference: Tensor) -> Float[Tensor, "2 3 height width"]:
-    if image.shape != reference.shape or image.ndim != 3:
-        raise ValueError(f"cannot compare images of {tuple(image.shape)} and {tuple(reference.shape)}")
-    pair = torch.stack([image, reference]).detach().to("cpu", torch.float32)
-    if not bool(torch.isfinite(pair).all()):
-        raise ValueError("cannot compare images that hold non-finite values")
-    return pair.clamp(0, 1)
+    check_comparable(image, reference)
+    return torch.stack([image, reference]).detach().to("cpu", torch.float32).clamp(0, 1)
 
 
 class Visual(Measure):
