@@ -56,8 +56,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ForkServer]:
         patch.chdir(folder)
         patch.setenv("PYTHONPATH", os.pathsep.join([str(folder), str(ROOT / "src")]))
         server = ForkServer()
+        # What runs in the background of a shell ignores interrupts, and so does all that it starts.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
         yield server
         server.close()
+        signal.signal(signal.SIGINT, before)
 
 
 def toy(*arguments: str, **environment: str) -> Order:
