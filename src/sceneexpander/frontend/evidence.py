@@ -129,7 +129,7 @@ def weigh_evidence(
             lens_sigma_deg=_lens_sigma_deg(
                 mapping, view, features, pairs, _own_parameters(mapping, view, hinted=hinted[view])
             ),
-            rival_angle_deg=_rival_angle_deg(mapping, view, features, pairs),
+            rival_angle_deg=rival_angle_deg(mapping, view, features, pairs),
             halves_deg=float(mapping.halves_deg[view]),
             spread_deg=max(float(mapping.spread_deg[view]), _crop_spread_deg(mapping, view, features, pairs)),
         )
@@ -217,6 +217,23 @@ def other_views(
     return found
 
 
+def rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
+    """How far (degrees) the direction to the only other view moves to a place from which a flat surface looks the same; 0 without one."""
+    others = [other for other in other_views(mapping, view, features, pairs) if len(other.own_xy) >= _MIN_MATCHES]
+    if len(others) != 1:  # from a third place a flat surface looks different
+        return 0.0
+    fit, best = _own_fit(mapping, view, others)
+    return largest_rival_angle_deg(
+        fit,
+        best,
+        others[0],
+        mapping.intrinsics[view],
+        threshold_px=mapping.config.epipolar_px * mapping.unit_px,
+        still_fits=_RIVAL_FITS,
+        seed=mapping.seed,
+    )
+
+
 def _agreeing_share(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
     others = other_views(mapping, view, features, pairs)
     if sum(len(other.own_xy) for other in others) < _MIN_MATCHES:
@@ -277,22 +294,6 @@ def _lens_sigma_deg(
         low, high = (_end_of(fit, best, parameter, sign) for sign in (-1.0, 1.0))
         worst = max(worst, float(np.median(direction_changes_deg(low, high, others))) / 2)
     return worst
-
-
-def _rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
-    others = [other for other in other_views(mapping, view, features, pairs) if len(other.own_xy) >= _MIN_MATCHES]
-    if len(others) != 1:  # from a third place a flat surface looks different
-        return 0.0
-    fit, best = _own_fit(mapping, view, others)
-    return largest_rival_angle_deg(
-        fit,
-        best,
-        others[0],
-        mapping.intrinsics[view],
-        threshold_px=mapping.config.epipolar_px * mapping.unit_px,
-        still_fits=_RIVAL_FITS,
-        seed=mapping.seed,
-    )
 
 
 def _crop_spread_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:

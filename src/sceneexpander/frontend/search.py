@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
-from sceneexpander.frontend.evidence import halves_apart_deg
+from sceneexpander.frontend.evidence import halves_apart_deg, rival_angle_deg
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.lens_tests import (
     doubt_focal,
@@ -174,10 +174,16 @@ class CameraSearch:
             refine = self._finish(model, refine)
         if refine:  # only now: a view with another lens than it seems to have leaves the focal of all uncertain
             model = self._with_focal_elsewhere(model)
-        elif start.source is not None and self.plan.refine and release_focal(model):
+        elif start.source is not None and self.plan.refine and not self._flat(model) and release_focal(model):
             self._finish(model, False)
             start = replace(start, sigma=self.config.focal_prior_sigma, source=None)
         return model, start, refine, attempted
+
+    def _flat(self, model: Mapping) -> bool:
+        """Whether two views see a surface so flat that they may stand elsewhere: the focal then goes along with where they are put."""
+        views = np.flatnonzero(model.registered).tolist()
+        most = self.config.max_spread_deg
+        return any(rival_angle_deg(model, view, self.features, self.pairs) > most for view in views)
 
     def _with_focal_elsewhere(self, model: Mapping) -> Mapping:
         """The model, or a better one at another main focal, where that is uncertain; it knows what other cameras would do as well.
