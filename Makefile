@@ -9,6 +9,11 @@ export SCENEEXPANDER_ROOT := $(CURDIR)
 export MLFLOW_DISABLE_TELEMETRY := true
 export MLFLOW_SERVER_ENABLE_JOB_EXECUTION := false
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Where no bytecode is wanted beside the sources it goes here: hundreds of interpreters start, and to compile torch costs each of them seconds.
+ifdef PYTHONDONTWRITEBYTECODE
+unexport PYTHONDONTWRITEBYTECODE
+export PYTHONPYCACHEPREFIX ?= $(CURDIR)/.cache/bytecode
+endif
 
 .PHONY: repro test test-unit test-conformance test-pipeline test-slow lint setup ui view expand ablation mini-scores clean help
 

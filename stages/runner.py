@@ -24,11 +24,10 @@ from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, di
 from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.packages import installed_packages
 from sceneexpander.pipeline.processes import end_with_parent
-from sceneexpander.pipeline.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV
+from sceneexpander.pipeline.project import ERROR_FILE_ENV, LIVE_FOLDER, ROOT_ENV, STAGE_ENV
 from sceneexpander.pipeline.unasked import write_unasked
 from stages import layout
 
-STAGE_ENV = "DVC_STAGE"  # set by DVC for the commands that it runs
 UNFINISHED_KEPT = 20  # interrupted works whose resume points stay, the latest first
 LIVE_KEPT = 20  # adaptations whose logs and pictures stay, the latest first
 
@@ -204,11 +203,14 @@ def left_out(cell: Cell) -> bool:
 
 
 def use_threads(count: int) -> None:
-    """Work with exactly ``count`` threads, whatever the shell says."""
+    """Work with exactly ``count`` threads, whatever the shell says; numpy's matrix products with one.
+
+    Theirs would spin while they wait for each other, and the matrices are small: see `sceneexpander.frontend.threads`.
+    """
     import threadpoolctl
     import torch
 
-    threadpoolctl.threadpool_limits(count)  # numpy's: it, too, adds up in another order for every number
+    threadpoolctl.threadpool_limits({"openmp": count, "blas": 1})
     torch.set_num_threads(count)
 
 

@@ -30,7 +30,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
     project = Project(tmp_path_factory.mktemp("pipeline") / "project")
     executed = project.repro()
     assert executed[0] == "code"
-    assert len(executed) == 34, executed
+    assert len(executed) == 28, executed
     yield project
     shutil.rmtree(project.folder, ignore_errors=True)
 
@@ -64,7 +64,8 @@ def test_everything_that_was_promised_is_there(finished: Project) -> None:
 def test_stages_read_what_they_depend_on_and_nothing_else(finished: Project) -> None:
     lock = yaml.safe_load((finished.folder / "dvc.lock").read_text())["stages"]
     notes = {path.name: path.read_text().splitlines() for path in finished.opened.iterdir()}
-    assert set(notes) == set(lock)
+    unasked = {name for name in lock if name.startswith(("rival@", "optimise@", "gaussian_splatting@"))}
+    assert set(notes) == set(lock) - unasked, "of what was not asked for no process is started"
     # By the hashes of the code, which each stage depends on its own of.
     hashes = {"outputs/code.json", "outputs/environment.json", "requirements.lock", "requirements-nodeps.lock"}
     # By hashes in the gathered folder: the Gaussians are too large to lie there as well.
@@ -104,7 +105,7 @@ def test_a_comment_reruns_no_work_and_code_reruns_what_uses_it(finished: Project
 def test_tracking_is_complete_and_records_once(finished: Project) -> None:
     assert finished.runs() == len(METHODS)
     shutil.rmtree(finished.folder / "mlflow")
-    assert finished.repro() == ["track"], "everything else comes from the cache"
+    assert finished.repro(plain=True) == ["track"], "everything else comes from the cache"
     assert finished.runs() == len(METHODS)
     finished.run("-m", "stages.track")
     assert finished.runs() == len(METHODS)
@@ -129,7 +130,6 @@ def test_a_setting_reruns_only_what_reads_it(finished: Project) -> None:
         "adapt@room-round0",
         "judge@room-round0",
         "propose@room-round0",
-        "optimise@room-round0-sceneexpander",
         "collect@room",
         "report",
         "track",

@@ -86,9 +86,10 @@ class Project:
         assert not check or done.returncode == 0, done.stdout + done.stderr
         return done
 
-    def repro(self) -> list[str]:
-        """Run the pipeline; returns the stages that were executed."""
-        return re.findall(r"Running stage '([^']+)'", self.run("-m", "dvc", "repro").stdout)
+    def repro(self, *, plain: bool = False) -> list[str]:
+        """Run the pipeline as `make repro` does, or as plain ``dvc repro``; returns the stages that were executed."""
+        command = ("-m", "dvc", "repro") if plain else ("-m", "sceneexpander.pipeline")
+        return re.findall(r"Running stage '([^']+)'", self.run(*command).stdout)
 
     def runs(self) -> int:
         with sqlite3.connect(self.folder / "mlflow" / "mlflow.db") as database:

@@ -28,7 +28,7 @@ _DEVICE = re.compile(r"cpu|cuda(:[0-9]{1,3})?")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProjectConfig:
-    """Everything that can be chosen. ``threads``: of torch and numpy; 0: one for each processor that there is."""
+    """Everything that can be chosen. ``threads``: of torch; 0: one for each processor that there is."""
 
     seed: Annotated[int, Range(0, 2**63 - 1)]
     device: str  # "cpu", "cuda", "cuda:1"

@@ -42,6 +42,7 @@ from sceneexpander.frontend.sfm_types import (
     SparseReconstruction,
     ViewReport,
 )
+from sceneexpander.frontend.threads import on_one_blas_thread
 from sceneexpander.frontend.twoview import (
     PairMatches,
     fit_rotation,
@@ -66,6 +67,7 @@ Judge = Callable[[SparseReconstruction], float]
 _log = logging.getLogger(__name__)
 
 
+@on_one_blas_thread
 def estimate_cameras(
     images: Float[Tensor, "view 3 height width"],
     config: SfmConfig,

@@ -6,14 +6,22 @@ judged by one test file. Everything else speaks to DVC through its files and its
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import functools
+import os
 import re
+import shutil
+import signal
+import sys
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sceneexpander.files import write_bytes_atomic
+from sceneexpander.pipeline.forkserver import ForkServer, read_order
 from sceneexpander.pipeline.unasked import answer_unasked
 
 
@@ -23,7 +31,7 @@ def reproduce(arguments: Sequence[str]) -> int:
 
     _take_any_path()
     _write_locks_by_stage()
-    _answer_unasked()
+    _start_stages()
     return int(main(["repro", *arguments]))
 
 
@@ -83,7 +91,7 @@ def reproduce_stage(address: str) -> None:
     from dvc.repo import Repo
 
     _write_locks_by_stage()
-    _answer_unasked()
+    _start_stages()
     Repo().reproduce(targets=[address], single_item=True)
 
 
@@ -120,23 +128,59 @@ def _take_any_path() -> None:
     bar.__init__, bar._takes_any_path = escaped, True
 
 
-def _answer_unasked() -> None:
-    """Let DVC start no process for a stage that only says that its method was not asked for.
+@functools.cache
+def _fork_server() -> ForkServer:
+    server = ForkServer()
+    atexit.register(server.close)
+    return server
 
-    Does nothing with a version of DVC that runs commands in another place: the stage says so itself then.
+
+def _start_stages() -> None:
+    """Let DVC fork its stages from a process that has loaded what they share, and start none where a stage has nothing to do.
+
+    Does nothing with a version of DVC that runs commands in another place: then every stage is an interpreter of its own.
     """
     from dvc.stage import run
 
-    if hasattr(run, "_answers_unasked") or not hasattr(run, "cmd_run"):
+    if hasattr(run, "_starts_stages") or not (hasattr(run, "cmd_run") and hasattr(run, "_run")):
         return
-    original, module = run.cmd_run, vars(run)
+    original, original_run, module = run.cmd_run, run._run, vars(run)
 
     def cmd_run(stage: Any, dry: bool = False, run_env: Any = None) -> None:
         parameters = {Path(file.fs_path): list(file.params) for file in stage.params}
         if dry or not answer_unasked(parameters, [Path(out.fs_path) for out in stage.outs]):
             original(stage, dry=dry, run_env=run_env)
 
-    module["cmd_run"], module["_answers_unasked"] = cmd_run, True
+    def run_command(executable: Any, cmd: str, **kwargs: Any) -> None:
+        more = {name: value for name, value in kwargs["env"].items() if os.environ.get(name) != value}
+        order = read_order(cmd, more)
+        if order is None or not _is_own_python() or not Path.cwd().samefile(kwargs["cwd"]):
+            original_run(executable, cmd, **kwargs)
+            return
+        with _uninterrupted():
+            code = _fork_server().run(order)
+        if code:
+            raise run.StageCmdFailedError(cmd, code)
+
+    module["cmd_run"], module["_run"], module["_starts_stages"] = cmd_run, run_command, True
+
+
+def _is_own_python() -> bool:
+    found = shutil.which("python")
+    return found is not None and Path(found).parent == Path(sys.executable).parent
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """As DVC does while a command runs: an interrupt is for the command to end by."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 _STAGE_LINE = re.compile(r"^  (?=[^ ])", re.MULTILINE)

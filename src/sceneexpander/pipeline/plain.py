@@ -13,12 +13,14 @@ import hashlib
 import json
 import os
 import shlex
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -35,9 +37,10 @@ from sceneexpander.pipeline.declared import (
     select_stages,
 )
 from sceneexpander.pipeline.disk import remove_tree, require_room
+from sceneexpander.pipeline.forkserver import ForkServer, read_order
 from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.processes import ended_by_signals, kept
-from sceneexpander.pipeline.project import find_project
+from sceneexpander.pipeline.project import STAGE_ENV, find_project
 from sceneexpander.pipeline.recording import ask_for_recording
 from sceneexpander.pipeline.surroundings import pipeline_environment
 from sceneexpander.pipeline.unasked import answer_unasked
@@ -116,6 +119,7 @@ class PlainRunner:
     ) -> None:
         self.folder, self.keep_going, self.jobs, self.force, self.held = folder, keep_going, jobs, force, tuple(held)
         self._processes: set[subprocess.Popen[bytes]] = set()
+        self._forks = ForkServer(self._start_forks)
         self._books = threading.Lock()  # stages run in threads of their own and share what is known of files
         saved = self._load()
         self.fingerprints, self.hasher = dict(saved.stages), Hasher(dict(saved.files))
@@ -165,6 +169,12 @@ class PlainRunner:
                 for process in [*self._processes]:
                     process.terminate()
                 raise
+            finally:
+                self._forks.close()
+
+    def _start_forks(self, command: Sequence[str], door: socket.socket) -> AbstractContextManager[object]:
+        environment = pipeline_environment(self.folder, self.folder)
+        return kept(command, cwd=self.folder, env=environment, held=self.held, stdin=door)
 
     def is_up_to_date(self, stage: DeclaredStage) -> bool:
         """Whether nothing that the stage depends on, and nothing that it made, has changed since it ran."""
@@ -201,17 +211,11 @@ class PlainRunner:
             path.parent.mkdir(parents=True, exist_ok=True)
         # What it reads is noted before it runs: an edit while it runs makes it run again.
         seen = self._fingerprint(stage)
-        program, *arguments = shlex.split(stage.command)
-        command = [sys.executable if program == "python" else program, *arguments]
-        environment = pipeline_environment(self.folder, self.folder) | {"DVC_STAGE": stage.address}
         started = time.monotonic()
         code = 0
         made = [self.folder / output.path for output in stage.outputs]
         if not answer_unasked({self.folder / file: keys for file, keys in stage.parameters.items()}, made):
-            with kept(command, cwd=self.folder, env=environment, held=self.held) as process:
-                self._processes.add(process)
-                code = process.wait()
-                self._processes.discard(process)
+            code = self._run_command(stage)
         missing = [output.path for output in stage.outputs if not (self.folder / output.path).exists()]
         if code or missing:
             return code or 1
@@ -219,6 +223,20 @@ class PlainRunner:
         self.ran.append(stage.address)
         print(f"done    {printable(stage.address)} ({time.monotonic() - started:.0f} s)", flush=True)
         return None
+
+    def _run_command(self, stage: DeclaredStage) -> int:
+        named = {STAGE_ENV: stage.address}
+        order = read_order(stage.command, named)
+        if order is not None:
+            return self._forks.run(order)
+        program, *arguments = shlex.split(stage.command)
+        command = [sys.executable if program == "python" else program, *arguments]
+        environment = pipeline_environment(self.folder, self.folder) | named
+        with kept(command, cwd=self.folder, env=environment, held=self.held) as process:
+            self._processes.add(process)
+            code = process.wait()
+            self._processes.discard(process)
+        return code
 
     def _fingerprint(self, stage: DeclaredStage) -> Fingerprint:
         with self._books:

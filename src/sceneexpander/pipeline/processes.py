@@ -11,6 +11,7 @@ import contextlib
 import ctypes
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -36,7 +37,12 @@ def _prctl(option: int, value: int) -> None:
 
 @contextlib.contextmanager
 def kept(
-    command: Sequence[str], *, cwd: Path, env: Mapping[str, str] | None = None, held: Sequence[int] = ()
+    command: Sequence[str],
+    *,
+    cwd: Path,
+    env: Mapping[str, str] | None = None,
+    held: Sequence[int] = (),
+    stdin: socket.socket | None = None,
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A running command that ends, with all that it started, at the end of the block at the latest.
 
@@ -45,11 +51,17 @@ def kept(
         cwd: its folder.
         env: its environment; None: this process's.
         held: descriptors of lock files that stay locked until the last process of the command is gone.
+        stdin: its standard input; None: this process's.
     """
     # Isolated (-I): the keeper needs the standard library only, and no variable of the shell changes it.
     keeper = [sys.executable, "-I", str(Path(__file__)), str(os.getpid()), *command]
     process = subprocess.Popen(
-        keeper, cwd=cwd, env=None if env is None else dict(env), start_new_session=True, pass_fds=tuple(held)
+        keeper,
+        cwd=cwd,
+        env=None if env is None else dict(env),
+        start_new_session=True,
+        pass_fds=tuple(held),
+        stdin=None if stdin is None else stdin.fileno(),
     )
     try:
         yield process

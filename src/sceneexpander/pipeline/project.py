@@ -11,6 +11,7 @@ ROOT_ENV = "SCENEEXPANDER_ROOT"  # set in workspaces: the main project folder, w
 ERROR_FILE_ENV = (
     "SCENEEXPANDER_ERROR_FILE"  # set by whoever starts a pipeline: where a stage leaves its one-line refusal
 )
+STAGE_ENV = "DVC_STAGE"  # set by DVC for the commands that it runs, and by whoever runs them in its place
 SWEEP_ENV = "SCENEEXPANDER_SWEEP"  # set in the jobs of a sweep: its id, a tag of the recorded runs
 
 GENERATED_FOLDER = Path(".cache") / "generated"  # in the project folder: answers of image services, by what was asked

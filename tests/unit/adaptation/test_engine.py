@@ -79,6 +79,7 @@ def test_outputs_of_a_bfloat16_pass_are_float32() -> None:
         assert {prediction.depth.dtype, prediction.normals.dtype, prediction.camera_vector.dtype} == {torch.float32}
 
 
+@pytest.mark.slow
 def test_compiled_blocks_give_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     # Tracing and dynamic shapes as in use; the code generator, which takes minutes on a CPU, is left out.
     compiled = Block.compile
