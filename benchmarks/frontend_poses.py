@@ -404,9 +404,9 @@ def show_set(item: CaseSet) -> None:
 
 
 def run_cases(
-    names: Sequence[str], seeds: Sequence[str], config: SfmConfig, *, known: bool, verbose: bool
-) -> list[CaseSet]:
-    """Measure and print case after case."""
+    names: Sequence[str], seeds: Sequence[str], config: SfmConfig, *, known: bool, verbose: bool, json_path: Path | None
+) -> None:
+    """Measure and print case after case; the file is written anew after each, since all of them take an hour."""
     print(CASE_HEADER, flush=True)
     every: list[CaseSet] = []
     for name in names:
@@ -417,9 +417,10 @@ def run_cases(
                 show_set(sets[-1])
         print(case_row(name, sets), flush=True)
         every += sets
+        if json_path is not None:
+            json_path.write_text(json.dumps([asdict(item) for item in every], indent=1))
     wrong, silent = sum(len(item.wrong) for item in every), sum(len(item.silent_wrong) for item in every)
     print(f"{len(every)} sets, {wrong} views wrong, {silent} of them silently, {sum(i.cpu_s for i in every):.0f} CPU-s")
-    return every
 
 
 def main() -> None:
@@ -443,9 +444,8 @@ def main() -> None:
         names = list(CASES) if arguments.cases == "all" else arguments.cases.split(",")
         if unknown := [name for name in names if name not in CASES]:
             parser.error(f"no such case: {', '.join(unknown)}; there are {', '.join(CASES)}")
-        sets = run_cases(names, arguments.seeds.split(","), config, known=arguments.known, verbose=arguments.verbose)
-        if arguments.json:
-            arguments.json.write_text(json.dumps([asdict(item) for item in sets], indent=1))
+        seeds = arguments.seeds.split(",")
+        run_cases(names, seeds, config, known=arguments.known, verbose=arguments.verbose, json_path=arguments.json)
         return
     rows: list[Row] = []
     summaries: dict[str, dict[str, float]] = {}

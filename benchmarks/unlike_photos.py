@@ -431,6 +431,11 @@ def exif_right_two_photos(place: Place) -> list[Photo]:
 
 
 @case
+def exif_right_three_photos(place: Place) -> list[Photo]:
+    return _with_exif(_plain(place)[-3:], mm_from_ratio(place.focal_ratio))
+
+
+@case
 def exif_wrong_five(place: Place) -> list[Photo]:
     ratio = ratio_from_mm(50)
     return _with_exif(_shots(_aimed(place, ratio), ratio, place), 28)
@@ -440,6 +445,12 @@ def exif_wrong_five(place: Place) -> list[Photo]:
 def exif_wrong_two(place: Place) -> list[Photo]:
     ratio = ratio_from_mm(50)
     return _with_exif(_shots(_aimed(place, ratio), ratio, place)[-2:], 28)
+
+
+@case
+def exif_wrong_three(place: Place) -> list[Photo]:
+    ratio = ratio_from_mm(50)
+    return _with_exif(_shots(_aimed(place, ratio), ratio, place)[-3:], 28)
 
 
 @case

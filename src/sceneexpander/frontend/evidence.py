@@ -32,6 +32,7 @@ _STILL_FITS = 1.15  # times what is unexplained at the best focal
 # The same for another explanation of a flat surface. Where there is next to no relief, the right one of the two was seen to leave 1.2 times
 # what the wrong one does, with the lens given; right poses of pairs with relief had no rival under 1.4.
 _RIVAL_FITS = 1.25
+_DIVISIONS = np.array([[1.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, -1.0]])  # (2, division): directions across the pictures
 _NOISE_PX = 0.5  # at 768 px: systematic errors of keypoints that the scatter of their errors does not show
 
 
@@ -128,7 +129,7 @@ def weigh_evidence(
             lens_sigma_deg=_lens_sigma_deg(
                 mapping, view, features, pairs, _own_parameters(mapping, view, hinted=hinted[view])
             ),
-            rival_angle_deg=_rival_angle_deg(mapping, view, features, pairs),
+            rival_angle_deg=rival_angle_deg(mapping, view, features, pairs),
             halves_deg=float(mapping.halves_deg[view]),
             spread_deg=max(float(mapping.spread_deg[view]), _crop_spread_deg(mapping, view, features, pairs)),
         )
@@ -140,8 +141,8 @@ def halves_apart_deg(
 ) -> Float[np.ndarray, " view"]:
     """Per view how far (degrees) the directions to the others differ between cameras of one half of the matches and of the other half.
 
-    The halves are left and right, then upper and lower parts of the pictures: wrong matches lie together, and so does what is flat. The
-    worse division counts; 0 where a half says too little.
+    The pictures are divided in four directions (left and right, upper and lower, along both diagonals): wrong matches lie together, and
+    so does what is flat. Their mean counts, since one half may be flat by chance; 0 where halves say too little.
 
     Args:
         mapping: finished model, where each half begins.
@@ -150,13 +151,13 @@ def halves_apart_deg(
     """
     usable = (tracks.seen & mapping.registered).sum(1) >= 2
     seen = (tracks.seen & mapping.registered)[usable]
-    apart = np.zeros(len(mapping.registered))
+    apart, asked = np.zeros((2, len(mapping.registered)))
     if len(seen) < 2 * _MIN_MATCHES:
         return apart
     views = np.flatnonzero(seen.any(0))
     at = np.where(seen[:, views, None], tracks.pixel_xy[usable][:, views], np.nan)
     offset = np.nanmean(at - np.nanmedian(at, axis=0), axis=1)  # (track, 2) from the middle of what each view shares
-    for along in offset.T:
+    for along in (offset @ _DIVISIONS).T:
         first = along < np.median(along)
         halves = []
         for side in (first, ~first):
@@ -164,8 +165,9 @@ def halves_apart_deg(
             half.finish(refine_focal=False, free=free)
             half.registered &= half.active.sum(0) >= _MIN_MATCHES
             halves.append(half)
-        apart = np.maximum(apart, directions_between_deg(halves[0], halves[1:]))
-    return apart
+        apart += directions_between_deg(halves[0], halves[1:])
+        asked += halves[0].registered & halves[1].registered
+    return apart / np.maximum(asked, 1)
 
 
 def common_doubt(photos: int, *, sure: int, depth: bool, focal_is_guess: bool) -> str:
@@ -213,6 +215,23 @@ def other_views(
                 )
             )
     return found
+
+
+def rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
+    """How far (degrees) the direction to the only other view moves to a place from which a flat surface looks the same; 0 without one."""
+    others = [other for other in other_views(mapping, view, features, pairs) if len(other.own_xy) >= _MIN_MATCHES]
+    if len(others) != 1:  # from a third place a flat surface looks different
+        return 0.0
+    fit, best = _own_fit(mapping, view, others)
+    return largest_rival_angle_deg(
+        fit,
+        best,
+        others[0],
+        mapping.intrinsics[view],
+        threshold_px=mapping.config.epipolar_px * mapping.unit_px,
+        still_fits=_RIVAL_FITS,
+        seed=mapping.seed,
+    )
 
 
 def _agreeing_share(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
@@ -275,22 +294,6 @@ def _lens_sigma_deg(
         low, high = (_end_of(fit, best, parameter, sign) for sign in (-1.0, 1.0))
         worst = max(worst, float(np.median(direction_changes_deg(low, high, others))) / 2)
     return worst
-
-
-def _rival_angle_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:
-    others = [other for other in other_views(mapping, view, features, pairs) if len(other.own_xy) >= _MIN_MATCHES]
-    if len(others) != 1:  # from a third place a flat surface looks different
-        return 0.0
-    fit, best = _own_fit(mapping, view, others)
-    return largest_rival_angle_deg(
-        fit,
-        best,
-        others[0],
-        mapping.intrinsics[view],
-        threshold_px=mapping.config.epipolar_px * mapping.unit_px,
-        still_fits=_RIVAL_FITS,
-        seed=mapping.seed,
-    )
 
 
 def _crop_spread_deg(mapping: Mapping, view: int, features: Sequence[Features], pairs: Sequence[PairMatches]) -> float:

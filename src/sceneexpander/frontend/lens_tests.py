@@ -43,14 +43,24 @@ _K_SIGMA = (0.3, 0.3)  # priors of k1 and k2; wide action cameras have k1 near -
 _BEND_ROUNDS = 8  # of looking for distortion; strong barrels settle in five
 _BEND_SETTLED_PX = 0.4  # at 768 px
 _MIN_BEND_PX = 1.0  # at 768 px: distortion that moves the outermost points less than this is left alone
+_GAIN_IN_DOUBT = 16.0  # the same for a focal that was said to be in doubt: two standard deviations
 _GAIN = 60.0  # of log-likelihood, by which a freer lens must explain a whole model better: eight correlated errors count as one
 
 
-def settle_lenses(mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches]) -> bool:
+def settle_lenses(
+    mapping: Mapping, features: Sequence[Features], pairs: Sequence[PairMatches], *, focal_said: bool = False
+) -> bool:
     """Find lenses that are not what they were taken for and correct them in place. Returns whether anything changed.
 
     First the one view that gains most from a lens of its own (zoomed, cropped): with its camera wrong, the others' are not beyond doubt.
-    Without such a view whole lenses (all photos cropped alike). Call it again once the model is finished anew.
+    Without such a view whole lenses (a focal that the files say and the pictures do not, all photos cropped alike). Call it again once the
+    model is finished anew.
+
+    Args:
+        mapping: finished model.
+        features: of all views.
+        pairs: as verified before any camera was known.
+        focal_said: the focal of the main lens is held to what the files say.
     """
     checks = _checks(mapping, features, pairs)
     if not checks:
@@ -62,6 +72,8 @@ def settle_lenses(mapping: Mapping, features: Sequence[Features], pairs: Sequenc
         if found is not None:
             check.adopt(found)
             return True
+    if focal_said and release_focal(mapping):
+        return True
     for lens in np.unique(mapping.lens_of[mapping.registered]):
         if (mapping.registered & (mapping.lens_of == lens)).sum() >= 3 and _free_shift(mapping, int(lens)):
             return True
@@ -279,6 +291,57 @@ class _LensCheck:
         rough = rough_poses(mapping.sighting(view, rows), mapping.log_focals_to_try(view, alone=True))
         judged = [self.fit.judge(pose.rotation, pose.translation, pose.lens) for pose in rough]
         return sorted(judged, key=lambda pose: pose.cost)[:_KEEP_BEST]
+
+
+def outvote_focal(mapping: Mapping) -> tuple[BundleResult, float] | None:
+    """(What adjustment makes of the model at a clearly other main focal, log-likelihood it gains); None if no other explains more.
+
+    Asked where the focal is held to what something other than matches says (files, straight lines); here to no more than what is usual.
+
+    Args:
+        mapping: finished model over matches that were found before any camera was known; unchanged.
+    """
+    lens = int(mapping.lens_of[mapping.main])
+    if mapping.assumed[lens]:
+        return None
+    free = mapping.copy()
+    free.assume_main_focal()
+    held = mapping.compare(mapping.lenses.free, mapping.prior_sigma)
+    freed = free.compare(mapping.lenses.free, free.prior_sigma)
+    if held is None or freed is None:
+        return None
+    moved = float(freed.problem.lenses.values[lens, LOG_FOCAL] - mapping.lenses.values[lens, LOG_FOCAL])
+    gain = _gain(held, freed)
+    _log.debug("held focal: another one %.3f away, gain %.1f", moved, gain)
+    return (freed, gain) if abs(moved) > _CLEARLY_OTHER and gain > 0 else None
+
+
+def release_focal(mapping: Mapping) -> bool:
+    """If another main focal explains much more than the one that it is held to, let go of that. Returns whether anything changed.
+
+    Args:
+        mapping: as for `outvote_focal`; corrected in place.
+    """
+    found = outvote_focal(mapping)
+    if found is None or found[1] < _GAIN:
+        return False
+    mapping.assume_main_focal()
+    mapping.take(found[0])
+    return True
+
+
+def doubt_focal(mapping: Mapping) -> Mapping | None:
+    """The model at another main focal that explains more than the one that it is held to, not by so much that it is let go; else None.
+
+    Args:
+        mapping: as for `outvote_focal`.
+    """
+    found = outvote_focal(mapping)
+    if found is None or found[1] < _GAIN_IN_DOUBT:
+        return None
+    other = mapping.copy()
+    other.take(found[0])
+    return other
 
 
 def _free_shift(mapping: Mapping, lens: int) -> bool:

@@ -102,6 +102,9 @@ class Mapping:
         self.assumed = np.zeros(views, bool) if assumed is None else assumed
         self.spread_deg = np.zeros(views)  # how far directions move to cameras that explain the photos about as well
         self.halves_deg = np.zeros(views)  # how far directions differ between two halves of the matches
+        self.rival_log_focal: float | None = (
+            None  # main focal that the matches go better with than with the one held to
+        )
         self.lens_guesses = {} if guesses is None else guesses
         self.crops = {} if crops is None else crops
         self.main = main
@@ -343,6 +346,16 @@ class Mapping:
             values[row, LOG_FOCAL] + log_factor, self.lenses.low[row, LOG_FOCAL], self.lenses.high[row, LOG_FOCAL]
         )
         self.lenses = replace(self.lenses, values=values)
+
+    def assume_main_focal(self) -> None:
+        """From now on hold the main focal to what is usual and no longer to what the files say."""
+        row = self.lens_of[self.main]
+        prior, prior_sigma, assumed = self.lenses.prior.copy(), self.prior_sigma.copy(), self.assumed.copy()
+        start_ratio = float(self.start_intrinsics[self.main, 0, 0] / self.shift_unit_px[self.main, 0])
+        prior[row, LOG_FOCAL] = np.log(self.config.focal_prior / start_ratio)
+        prior_sigma[row, LOG_FOCAL], assumed[row] = self.config.focal_prior_sigma, True
+        self.lenses = replace(self.lenses, prior=prior)
+        self.prior_sigma, self.assumed = prior_sigma, assumed
 
     def split_lens(self, view: int) -> None:
         """Make a view a lens of its own, with the values of the one it had and little held against another focal."""

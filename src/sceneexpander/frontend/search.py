@@ -13,9 +13,17 @@ import numpy as np
 from jaxtyping import Bool
 
 from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
-from sceneexpander.frontend.evidence import halves_apart_deg
+from sceneexpander.frontend.evidence import halves_apart_deg, rival_angle_deg
 from sceneexpander.frontend.features import Features
-from sceneexpander.frontend.lens_tests import find_apart_group, mean_cost, pair_costs, settle_lenses, snap_lenses
+from sceneexpander.frontend.lens_tests import (
+    doubt_focal,
+    find_apart_group,
+    mean_cost,
+    pair_costs,
+    release_focal,
+    settle_lenses,
+    snap_lenses,
+)
 from sceneexpander.frontend.lenses import FocalStart, LensPlan
 from sceneexpander.frontend.mapping import CropOfMain, Mapping, directions_between_deg
 from sceneexpander.frontend.sfm_setup import KnownCameras, Setup
@@ -80,6 +88,13 @@ class CameraSearch:
             guided.grow(refine_focal=False, free=self._free_views(guided))
             refine = self._finish(guided, refine)
             model = guided
+        if start.source is not None and self.plan.refine:
+            before = model.over(tracks)
+            before.finish(refine_focal=False, free=self._free_views(model))
+            other = doubt_focal(before)
+            if other is not None:
+                model.rival_log_focal = float(other.log_focal[model.main])
+                model.spread_deg = np.maximum(model.spread_deg, directions_between_deg(before, [other]))
         if refine:  # with a focal that is held and a little wrong, halves differ by that
             apart = halves_apart_deg(model, tracks, self._free_views(model))
             model.halves_deg = np.where(self.plan.generated, 0.0, apart)  # whether those fit is asked elsewhere
@@ -147,7 +162,7 @@ class CameraSearch:
         refine = self._finish(model, attempted)
         for _ in range(self.config.lens_rounds if refine else 0):
             freer = model.copy()
-            if not settle_lenses(freer, self.features, self.pairs):
+            if not settle_lenses(freer, self.features, self.pairs, focal_said=start.source is not None):
                 break
             freer.grow(refine_focal=True, free=free)
             refined = self._finish(freer, refine)
@@ -159,7 +174,16 @@ class CameraSearch:
             refine = self._finish(model, refine)
         if refine:  # only now: a view with another lens than it seems to have leaves the focal of all uncertain
             model = self._with_focal_elsewhere(model)
+        elif start.source is not None and self.plan.refine and not self._flat(model) and release_focal(model):
+            self._finish(model, False)
+            start = replace(start, sigma=self.config.focal_prior_sigma, source=None)
         return model, start, refine, attempted
+
+    def _flat(self, model: Mapping) -> bool:
+        """Whether two views see a surface so flat that they may stand elsewhere: the focal then goes along with where they are put."""
+        views = np.flatnonzero(model.registered).tolist()
+        most = self.config.max_spread_deg
+        return any(rival_angle_deg(model, view, self.features, self.pairs) > most for view in views)
 
     def _with_focal_elsewhere(self, model: Mapping) -> Mapping:
         """The model, or a better one at another main focal, where that is uncertain; it knows what other cameras would do as well.

@@ -206,6 +206,12 @@ def _view_warnings(
             f"its file says a focal length of {_in_mm(hint):.0f} mm (35 mm equivalent), the pictures say {_in_mm(ratio):.0f} mm:"
             " the pictures are believed"
         )
+    elif np.isfinite(hint) and shared and mapping.rival_log_focal is not None:
+        rival = ratio * float(np.exp(mapping.rival_log_focal - mapping.log_focal[mapping.main]))
+        said.append(
+            f"its file says a focal length of {_in_mm(hint):.0f} mm (35 mm equivalent), the pictures go better with"
+            f" {_in_mm(rival):.0f} mm: the file is believed"
+        )
     return tuple(said)
 
 
@@ -221,6 +227,8 @@ def _notes(mapping: Mapping, source: FocalSource) -> tuple[str, ...]:
         notes.append("no point could be triangulated: the views share no matches with parallax")
     if source is FocalSource.SWEPT:
         notes.append("the focal is the best of a few plausible values: too few views to refine it")
+    if source is FocalSource.HINT:
+        notes.append("the focal is the one that the files say: too few views to check it, and directions depend on it")
     if source is FocalSource.LINES:
         notes.append("the focal is the one that straight lines in the pictures agree on: too few views to refine it")
     if source is FocalSource.TURNED:

@@ -155,7 +155,7 @@ class SfmConfig:
     # How far directions move to other cameras that explain the photos about as well (another focal, another slope of a flat surface).
     max_spread_deg: Annotated[float, Range(0, 180)] = 4.0
     # How far directions differ between two halves of the matches: twice the error of the whole, if nothing but chance sets them apart.
-    max_halves_deg: Annotated[float, Range(0, 180)] = 3.0
+    max_halves_deg: Annotated[float, Range(0, 180)] = 2.0
     # A view of its own focal is left out if that leaves the directions to others more open than this.
     max_own_direction_deg: Annotated[float, Range(0, 180)] = 2.0
     refine_known_poses: bool = False  # True: given poses are a start, not the truth

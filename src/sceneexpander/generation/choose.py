@@ -5,18 +5,19 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from jaxtyping import Float
 from torch import Tensor
 
 from sceneexpander.artifacts.agreement import CandidateScore
 from sceneexpander.artifacts.candidates import Candidate
-from sceneexpander.artifacts.inserted import InsertedView
+from sceneexpander.artifacts.inserted import InsertedView, Provenance
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.errors import UserError
 from sceneexpander.generation.assess import Assessed, assess
 from sceneexpander.generation.backends import make_generator
-from sceneexpander.generation.backends.stored import own_picture
+from sceneexpander.generation.backends.stored import ReplayConfig, own_picture
 from sceneexpander.generation.config import AUTO, ChoiceConfig, GeneratorConfig
 from sceneexpander.generation.misalignment import report_misalignment
 from sceneexpander.generation.opinion import judge_candidates
@@ -125,6 +126,13 @@ def _picked(assessed: Sequence[Assessed], choice: ChoiceConfig, context: Generat
     return usable[0] if usable else 0
 
 
+def _place_of(provenance: Provenance, context: GenerationContext) -> Path | str:
+    """Where a picture lies: a recorded one in the scene's folder, so that whoever made that of a user's files can name those."""
+    if provenance.backend != ReplayConfig().backend:
+        return provenance.source
+    return (context.scene_folder if context.recorded is None else context.recorded) / provenance.source
+
+
 def _inserted(
     context: GenerationContext,
     assessed: Sequence[Assessed],
@@ -134,7 +142,7 @@ def _inserted(
 ) -> InsertedView:
     item = assessed[chosen]
     if item.picture is None or item.fitted is None:
-        raise UserError(item.provenance.refusal or "no picture", where=item.provenance.source)
+        raise UserError(item.provenance.refusal or "no picture", where=_place_of(item.provenance, context))
     view: ViewSet = view_from_fitted(
         item.picture.facts,
         item.fitted,

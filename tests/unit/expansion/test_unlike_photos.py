@@ -23,6 +23,7 @@ from sceneexpander.reconstruction.optics import optics_of
 
 SCENE = Path(__file__).parents[3] / "scenes" / "courtyard"
 CONFIG = SfmConfig(learned=LearnedUse.NEVER)
+FEWER = SfmConfig(learned=LearnedUse.NEVER, max_features=2000)  # enough to tell which photo is odd
 FOCAL_PX = 691.2  # of the bundled photos
 Change = Callable[[Image.Image, int], Image.Image]
 
@@ -41,11 +42,11 @@ def photos(folder: Path, change: Change, count: int = 5, **save: object) -> list
 class Posed:
     """What the front-end makes of files, against the truth."""
 
-    def __init__(self, paths: list[Path]) -> None:
+    def __init__(self, paths: list[Path], config: SfmConfig = CONFIG) -> None:
         self.views = read_views(paths, IngestConfig()).views
         self.found: SparseReconstruction = estimate_cameras(
             self.views.images,
-            CONFIG,
+            config,
             generator=torch.Generator().manual_seed(0),
             feature_images=self.views.detail_images,
             names=[record.name for record in self.views.records],
@@ -127,7 +128,7 @@ def test_a_zoomed_photo_is_right_or_named(tmp_path: Path) -> None:
         part = picture.crop((width // 4, height // 4, width // 4 + width // 2, height // 4 + height // 2))
         return part.resize(picture.size, Image.Resampling.LANCZOS)
 
-    made = Posed(photos(tmp_path, zoomed))
+    made = Posed(photos(tmp_path, zoomed), FEWER)
     turn, direction = made.errors_deg()
     assert turn < 0.5
     assert direction < 2.0
@@ -181,7 +182,7 @@ def test_strict_ends_the_run_and_otherwise_it_is_said(tmp_path: Path, caplog: py
         lambda picture, number: picture.transpose(Image.Transpose.FLIP_LEFT_RIGHT) if number == 2 else picture,
         3,
     )
-    made = Posed(mirrored)
+    made = Posed(mirrored, FEWER)
     assert [view.posed for view in made.report.views] == [True, True, False]
     assert "mirrored" in made.report.views[2].reason
     with caplog.at_level(logging.INFO):

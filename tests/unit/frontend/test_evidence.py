@@ -9,14 +9,24 @@ import pytest
 import sfm_worlds as worlds
 from test_epipolar import model_of, noisy, seen_through
 
-from sceneexpander.frontend.bundle import rotation_exp
+from sceneexpander.frontend.bundle import LOG_FOCAL, SHIFT_X, SHIFT_Y, rotation_exp
 from sceneexpander.frontend.evidence import ViewEvidence, common_doubt, halves_apart_deg, weigh_evidence
-from sceneexpander.frontend.lens_tests import find_apart_group, pair_costs, rival_lens_deg
+from sceneexpander.frontend.features import Features
+from sceneexpander.frontend.lens_tests import (
+    doubt_focal,
+    find_apart_group,
+    outvote_focal,
+    pair_costs,
+    release_focal,
+    rival_lens_deg,
+    settle_lenses,
+)
 from sceneexpander.frontend.mapping import Mapping, directions_between_deg
 from sceneexpander.frontend.search import CameraSearch
 from sceneexpander.frontend.sfm_setup import KnownCameras
 from sceneexpander.frontend.sfm_types import SfmConfig
 from sceneexpander.frontend.tracks import Tracks
+from sceneexpander.frontend.twoview import PairMatches
 
 CONFIG = SfmConfig()
 FINE = ViewEvidence(
@@ -171,6 +181,54 @@ def test_a_view_that_another_focal_explains_better_is_in_doubt_and_no_other_is()
     turned = rival_lens_deg(*model_of(noisy(seen_through(world, 4, zoom=1.5))))
     assert turned[4] > CONFIG.max_spread_deg
     assert (turned[:4] == 0).all()
+
+
+def told(seed: int, views: int, factor: float) -> tuple[Mapping, list[Features], list[PairMatches]]:
+    """A model of some views whose focal is held to what their files say: that many times the right one."""
+    mapping, features, pairs = model_of(noisy(worlds.point_world(seed, points=250)))
+    mapping.registered[views:] = False
+    mapping.move_main_focal(np.log(factor))
+    prior, sigma = mapping.lenses.prior.copy(), mapping.prior_sigma.copy()
+    prior[:, LOG_FOCAL], sigma[:, LOG_FOCAL] = np.log(factor), CONFIG.focal_hint_sigma
+    mapping.lenses, mapping.prior_sigma = replace(mapping.lenses, prior=prior), sigma
+    mapping.finish(refine_focal=False)
+    return mapping, features, pairs
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_a_focal_that_files_say_rightly_is_left_alone(views: int) -> None:
+    mapping, features, pairs = told(60, views, 1.0)
+    assert outvote_focal(mapping) is None
+    assert doubt_focal(mapping) is None
+    assert not settle_lenses(mapping, features, pairs, focal_said=True)
+
+
+@pytest.mark.parametrize(("views", "factor"), [(2, 0.65), (3, 1.5)])
+def test_a_focal_that_files_say_wrongly_is_let_go(views: int, factor: float) -> None:
+    mapping = told(60, views, factor)[0]
+    assert release_focal(mapping)
+    mapping.finish(refine_focal=False)
+    np.testing.assert_allclose(mapping.log_focal, 0.0, atol=0.12)
+    assert not release_focal(mapping), "it is held to nothing any more"
+
+
+def test_a_whole_set_whose_files_lie_finds_its_focal() -> None:
+    mapping, features, pairs = told(60, 5, 1.5)
+    for _ in range(CONFIG.lens_rounds):
+        if not settle_lenses(mapping, features, pairs, focal_said=True):
+            break
+        mapping.finish(refine_focal=True)
+    np.testing.assert_allclose(mapping.log_focal, 0.0, atol=0.03)
+    np.testing.assert_allclose(mapping.lenses.values[:, [SHIFT_X, SHIFT_Y]], 0.0, atol=0.01)
+
+
+def test_two_photos_that_go_a_little_better_with_another_focal_are_in_doubt() -> None:
+    mapping = told(61, 2, 1.5)[0]
+    assert not release_focal(mapping)
+    other = doubt_focal(mapping)
+    assert other is not None
+    assert other.log_focal[0] < mapping.log_focal[0] - 0.2
+    assert directions_between_deg(mapping, [other]).max() > 0.5
 
 
 def test_matches_behind_a_camera_do_not_agree_with_it() -> None:

