@@ -9,6 +9,7 @@ import pytest
 import sfm_worlds as worlds
 from test_epipolar import model_of, noisy, seen_through
 
+from sceneexpander.frontend import evidence
 from sceneexpander.frontend.bundle import LOG_FOCAL, SHIFT_X, SHIFT_Y, rotation_exp
 from sceneexpander.frontend.evidence import ViewEvidence, common_doubt, halves_apart_deg, weigh_evidence
 from sceneexpander.frontend.features import Features
@@ -147,6 +148,14 @@ def test_halves_of_the_matches_tell_one_camera_only_where_there_is_depth(relief:
     mapping, tracks = seen_before(relief)
     apart = halves_apart_deg(mapping, tracks).max()
     assert apart < 0.5 if relief == 1 else apart > CONFIG.max_halves_deg
+
+
+def test_one_half_that_is_flat_by_chance_is_a_quarter_of_the_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapping, tracks = seen_before(1.0)
+    told = iter([np.full(5, degrees) for degrees in (8.0, 1.0, 1.0, 2.0)])
+    monkeypatch.setattr(evidence, "directions_between_deg", lambda *_: next(told))
+    assert np.allclose(halves_apart_deg(mapping, tracks), 3.0)
+    assert next(told, None) is None, "four ways to halve"
 
 
 def test_halves_say_nothing_of_given_poses_nor_where_there_is_little() -> None:
