@@ -6,6 +6,7 @@ system could hold. Whatever is read on behalf of a user goes through here.
 
 from __future__ import annotations
 
+import codecs
 import errno
 import os
 import stat
@@ -77,6 +78,16 @@ def read_plain_file(path: Path, *, limit_bytes: int, where: str | Path | None = 
     except OSError as error:
         raise _unreachable(path, error, where) from None
     raise UserError(f"is larger than the {_size(limit_bytes)} allowed", where=where or path)
+
+
+def decode_text(data: bytes, errors: str = "strict") -> str:
+    """Text of another program's file: UTF-8, or UTF-16 where its mark comes first, as programs for Windows write it.
+
+    Raises:
+        UnicodeDecodeError: it is neither, and ``errors`` is ``strict``.
+    """
+    marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if marked else "utf-8-sig", errors)
 
 
 def _stat(path: Path, where: str | Path | None) -> os.stat_result:

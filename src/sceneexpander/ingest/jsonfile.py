@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneexpander.errors import UserError
-from sceneexpander.plainfiles import read_plain_file
+from sceneexpander.plainfiles import decode_text, read_plain_file
 
 _LIMIT_BYTES = 256 * 2**20
 
@@ -21,9 +21,9 @@ def read_user_json(path: Path) -> dict[str, Any]:
     """
     data = read_plain_file(path, limit_bytes=_LIMIT_BYTES)
     try:
-        value = json.loads(data.decode("utf-8-sig"))
+        value = json.loads(decode_text(data))
     except UnicodeDecodeError:
-        raise UserError("is not UTF-8 text", where=path) from None
+        raise UserError("is not UTF-8 or UTF-16 text", where=path) from None
     except json.JSONDecodeError as error:
         raise UserError(f"is not valid JSON (line {error.lineno}: {error.msg})", where=path) from None
     except (RecursionError, ValueError):  # the second: numbers of thousands of digits

@@ -60,6 +60,20 @@ def test_each_kind_is_recognised_and_its_poses_are_read(tmp_path: Path, name: st
 
 
 @pytest.mark.parametrize("name", MAKERS)
+def test_text_as_programs_for_windows_write_it_is_read_the_same(tmp_path: Path, name: str) -> None:
+    for kind in ("plain", "wide"):
+        MAKERS[name](tmp_path / kind)
+    texts = [path for path in (tmp_path / "wide").rglob("*") if path.suffix in (".txt", ".json", ".csv")]
+    for path in texts:
+        path.write_bytes(path.read_text().encode("utf-16"))
+    plain, wide = (read_capture(tmp_path / kind, CONFIG) for kind in ("plain", "wide"))
+    assert wide.notes == plain.notes
+    for one, other in zip(plain.shots, wide.shots, strict=True):
+        assert one.lens == other.lens
+        np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
+
+
+@pytest.mark.parametrize("name", MAKERS)
 def test_a_staged_copy_reads_as_the_original_does(tmp_path: Path, name: str) -> None:
     (tmp_path / "data").mkdir()
     MAKERS[name](tmp_path / "data")

@@ -16,7 +16,7 @@ from sceneexpander.ingest.lens_models import Lens
 from sceneexpander.ingest.sources.capture import Capture, Shot, name_some, number_array, rigid_pose
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.survey import MASKS_FOLDER, list_pictures, natural_key
-from sceneexpander.plainfiles import read_plain_file
+from sceneexpander.plainfiles import decode_text, read_plain_file
 
 _LIMIT_BYTES = 2**20
 _MILLIMETRES = 0.001
@@ -181,7 +181,7 @@ def _depth_of(stem: str, place: Path, folders: tuple[str, ...]) -> DepthFile | N
 def _numbers(path: Path, counts: tuple[int, ...], *, finite: bool = True) -> np.ndarray:
     """All numbers of a small text file. Raises `UserError` unless it holds as many of them as one of ``counts``, and ``finite`` ones."""
     try:
-        words = read_plain_file(path, limit_bytes=_LIMIT_BYTES).decode().split()
+        words = decode_text(read_plain_file(path, limit_bytes=_LIMIT_BYTES)).split()
         numbers = [float(word) for word in words]
         values = number_array(numbers, path) if finite else np.asarray(numbers)
     except ValueError:

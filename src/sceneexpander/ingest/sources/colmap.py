@@ -20,7 +20,7 @@ from sceneexpander.ingest.lens_models import Lens, Projection
 from sceneexpander.ingest.sources.capture import Capture, Shot, member, name_some, number_array, rigid_pose
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.survey import MASKS_FOLDER, natural_key
-from sceneexpander.plainfiles import read_plain_file
+from sceneexpander.plainfiles import decode_text, read_plain_file
 
 _LIMIT_BYTES = 2 * 2**30  # images.bin lists every keypoint
 _MODEL_FOLDERS = (
@@ -245,9 +245,9 @@ _Cameras = dict[int, tuple[str, tuple[int, int], tuple[float, ...]]]
 def _lines(path: Path) -> list[str]:
     data = read_plain_file(path, limit_bytes=_LIMIT_BYTES)
     try:
-        return [line.rstrip("\r") for line in data.decode("utf-8-sig").split("\n")]
+        return [line.rstrip("\r") for line in decode_text(data).split("\n")]
     except UnicodeDecodeError:
-        raise UserError("is not UTF-8 text", where=path) from None
+        raise UserError("is not UTF-8 or UTF-16 text", where=path) from None
 
 
 def _cameras_of_text(path: Path) -> _Cameras:

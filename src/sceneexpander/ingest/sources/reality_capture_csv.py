@@ -24,7 +24,7 @@ from sceneexpander.ingest.sources.capture import Capture, Shot, name_some, numbe
 from sceneexpander.ingest.sources.photos import mask_of
 from sceneexpander.ingest.sources.reality_capture import make_lens
 from sceneexpander.ingest.survey import MASKS_FOLDER, list_pictures, natural_key
-from sceneexpander.plainfiles import read_plain_file
+from sceneexpander.plainfiles import decode_text, read_plain_file
 
 _LIMIT_BYTES = 16 * 2**20
 _HEAD_BYTES = 4096
@@ -74,7 +74,7 @@ def _looks_right(path: Path) -> bool:
             head = file.read(_HEAD_BYTES)
     except OSError:
         return False
-    return any(_columns(line) is not None for line in head.decode("utf-8-sig", "replace").splitlines())
+    return any(_columns(line) is not None for line in decode_text(head, "replace").splitlines())
 
 
 def _columns(line: str) -> list[str] | None:
@@ -86,9 +86,9 @@ def _columns(line: str) -> list[str] | None:
 def _cameras(path: Path) -> dict[str, dict[str, float]]:
     """By picture the numbers of its row, by column."""
     try:
-        lines = read_plain_file(path, limit_bytes=_LIMIT_BYTES).decode("utf-8-sig").splitlines()
+        lines = decode_text(read_plain_file(path, limit_bytes=_LIMIT_BYTES)).splitlines()
     except UnicodeDecodeError:
-        raise UserError("is not text (UTF-8)", where=path) from None
+        raise UserError("is not UTF-8 or UTF-16 text", where=path) from None
     columns: list[str] | None = None
     cameras: dict[str, dict[str, float]] = {}
     for number, line in enumerate(lines, start=1):
