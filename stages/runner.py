@@ -177,7 +177,7 @@ def _measured(path: Path | None) -> Iterator[None]:
     record: dict[str, Any] = {
         "started": round(started, 3),
         "wall_s": round(time.perf_counter() - wall, 3),
-        "cpu_s": round(time.process_time() + sum(os.times()[2:4]), 3),  # start-up and helpers included
+        "cpu_s": round(time.process_time() + sum(os.times()[2:4]), 3),  # with helpers; without what a fork found loaded
         "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
         "host": {"machine": platform.machine(), "cpus": os.cpu_count(), "torch": "not used"},
     }

@@ -1,7 +1,7 @@
 """All that is used of DVC's Python code, private functions included.
 
-DVC is pinned in the lock; ``tests/unit/pipeline/test_dvc_adapter.py`` states what each of these has to do, so that another version can be
-judged by one test file. Everything else speaks to DVC through its files and its command line.
+DVC is pinned in the lock; ``test_dvc_adapter.py`` and ``test_forkserver.py`` in ``tests/unit/pipeline`` state what each of these has
+to do, so that another version can be judged by two test files. Everything else speaks to DVC through its files and its command line.
 """
 
 from __future__ import annotations

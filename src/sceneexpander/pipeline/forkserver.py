@@ -1,6 +1,6 @@
 """Stages that start where torch is loaded already.
 
-To load torch and what goes with it takes about three CPU seconds, longer than many a stage works, and a run starts some thirty stages.
+To load torch and what goes with it takes two to three CPU seconds, longer than many a stage works, and a run starts some thirty stages.
 Here one process (this file as a program) loads it once and forks for every stage. It loads nothing of the project, so that a stage runs
 the code that is there when it starts. A stage remains a process of its own: its memory, threads, environment, signals, exit code and end.
 
@@ -42,9 +42,11 @@ _SHARED = (
     "PIL.ImageCms",
     "av",
     "rich.progress",
+    "scipy.linalg",
+    "scipy.spatial",
+    "scipy.sparse.csgraph",
 )
-_SHARED_LATER = ("scipy.linalg", "scipy.spatial", "scipy.sparse.csgraph")
-PROGRAM = "sceneexpander.pipeline.forkserver"
+_PROGRAM = "sceneexpander.pipeline.forkserver"
 _LENGTH = struct.Struct("!I")
 _LOST = 1  # exit code of a stage whose server is gone
 _PLAIN = re.compile(r"(?:'[^']*'|[\w@%+=:,./ -])+", re.ASCII)  # words that mean the same to every shell, and to none
@@ -126,7 +128,7 @@ class ForkServer:
             self._origin = origin
             self._door, its = socket.socketpair()
             with its:
-                self._running.enter_context(self._start([sys.executable, "-m", PROGRAM], its))
+                self._running.enter_context(self._start([sys.executable, "-m", _PROGRAM], its))
         return self._door
 
     def _close(self) -> None:
@@ -208,7 +210,7 @@ def main() -> None:
     end_with_parent()
     interrupt: Any = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the stage as well, which says what it does
-    for name in (*_SHARED, *_SHARED_LATER):
+    for name in _SHARED:
         with contextlib.suppress(ImportError):  # the stage that needs it says what is missing
             importlib.import_module(name)
     order = _Server(socket.socket(fileno=0)).wait_for_order()

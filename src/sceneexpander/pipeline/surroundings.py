@@ -51,7 +51,7 @@ def pipeline_environment(folder: Path, project: Path, *, error_file: Path | None
         "MLFLOW_DISABLE_TELEMETRY": "true",
     }
     if os.environ.get("PYTHONDONTWRITEBYTECODE"):
-        # Nothing is wanted beside the sources. But a run starts some forty interpreters, and to compile torch costs each of them seconds.
+        # Nothing is wanted beside the sources. But a run starts several interpreters, and to compile torch costs each of them seconds.
         environment.setdefault("PYTHONPYCACHEPREFIX", str(project / ".cache" / "bytecode"))
     environment.pop(ERROR_FILE_ENV, None)
     if error_file is not None:

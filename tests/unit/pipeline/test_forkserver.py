@@ -14,7 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from sceneexpander.pipeline import dvc_adapter
+from sceneexpander.pipeline.declared import read_pipeline
 from sceneexpander.pipeline.forkserver import ForkServer, Order, read_order
+from sceneexpander.pipeline.plain import PlainRunner
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="stages are forked on Linux only")
 
@@ -145,6 +148,57 @@ def test_stages_end_with_their_server_and_the_next_one_gets_a_new_server(
         assert time.monotonic() < deadline, "the stage goes on without its server"
         time.sleep(0.01)
     assert server.run(toy("exit", "5")) == 5
+
+
+PIPELINE = """
+stages:
+  toy:
+    matrix: {name: [a, b]}
+    cmd: python -m stages.toy parent '${item.name}'
+    outs: ["${item.name}"]
+"""
+
+
+@pytest.fixture
+def pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two stages of ours, each of which writes down who started it and as which stage."""
+    (tmp_path / "stages").mkdir()
+    (tmp_path / "stages" / "__init__.py").write_text("")
+    (tmp_path / "stages" / "toy.py").write_text(
+        "import os, sys\nfrom pathlib import Path\n"
+        "Path(sys.argv[2]).write_text(Path(f'/proc/{os.getppid()}/cmdline').read_text() + ' ' + os.environ['DVC_STAGE'])\n"
+    )
+    (tmp_path / "dvc.yaml").write_text(PIPELINE)
+    (tmp_path / "params.yaml").write_text("scenes: []\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), str(ROOT / "src")]))
+    monkeypatch.setenv("PATH", os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
+    return tmp_path
+
+
+def check_forked(folder: Path) -> None:
+    for name in "ab":
+        started_by = (folder / name).read_text()
+        assert "sceneexpander.pipeline.forkserver" in started_by
+        assert started_by.endswith(f"toy@{name}")
+
+
+def test_dvc_forks_its_stages(pipeline: Path) -> None:
+    from dvc.repo import Repo
+
+    Repo.init(pipeline, no_scm=True)
+    try:
+        assert dvc_adapter.reproduce(["--quiet"]) == 0
+    finally:
+        dvc_adapter._fork_server().close()
+    check_forked(pipeline)
+
+
+def test_the_plain_runner_forks_its_stages(pipeline: Path) -> None:
+    runner = PlainRunner(pipeline, jobs=2)
+    runner.run(read_pipeline(pipeline))
+    assert not runner.failed
+    check_forked(pipeline)
 
 
 @pytest.mark.parametrize(
