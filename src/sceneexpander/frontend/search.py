@@ -59,6 +59,15 @@ class PairKinds:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FoundCameras:
+    """A finished model, what it was over the matches that were found before any camera was known, and where its main focal came from."""
+
+    mapping: Mapping
+    unguided: Mapping
+    focal_source: FocalSource
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CameraSearch:
     """Matched views, and what is known of their cameras. ``features`` are those of pinhole cameras."""
 
@@ -70,8 +79,8 @@ class CameraSearch:
     config: SfmConfig
     setup: Setup
 
-    def run(self) -> tuple[Mapping, FocalSource]:
-        """The best model, finished; and where its main focal came from."""
+    def run(self) -> FoundCameras:
+        """The best model, finished."""
         config = self.config
         tracks = build_tracks(self.features, self.pairs)
         begun = self._best_start(tracks)
@@ -80,6 +89,7 @@ class CameraSearch:
         model, start, refine, attempted = self._settled(tracks, *begun)
         if refine and not self.known.posed.any():
             model = self._with_groups_apart(tracks, model)
+        unguided = model
         # Only now: matches found again in the epipolar bands of a wrong camera would only agree with it.
         if config.guided:
             again = build_tracks(self.features, self._guided_pairs(model))
@@ -98,20 +108,22 @@ class CameraSearch:
         if refine:  # with a focal that is held and a little wrong, halves differ by that
             apart = halves_apart_deg(model, tracks, self._free_views(model))
             model.halves_deg = np.where(self.plan.generated, 0.0, apart)  # whether those fit is asked elsewhere
-            return model, FocalSource.REFINED
+            return FoundCameras(mapping=model, unguided=unguided, focal_source=FocalSource.REFINED)
         if self.plan.refine:
             others = [self._moved(model, sign * start.sigma) for sign in (-1, 1)]
             model.spread_deg = np.maximum(model.spread_deg, directions_between_deg(model, others))
-        return model, start.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)
+        source = start.source or (FocalSource.ASSUMED if attempted else FocalSource.SWEPT)
+        return FoundCameras(mapping=model, unguided=unguided, focal_source=source)
 
-    def _without_points(self, tracks: Tracks) -> tuple[Mapping, FocalSource]:
+    def _without_points(self, tracks: Tracks) -> FoundCameras:
         """A model of cameras alone, where nothing has parallax."""
         plan = self.plan
         turning = 1.0 if self.found.turning_focal is None else self.found.turning_focal
         ratio = plan.starts[0].ratio if plan.source else self.config.focal_prior
         empty = self._new_mapping(tracks, replace(plan.starts[0], ratio=turning * ratio))
         self._set_known_poses(empty)
-        return empty, plan.source or (FocalSource.ASSUMED if turning == 1 else FocalSource.TURNED)
+        source = plan.source or (FocalSource.ASSUMED if turning == 1 else FocalSource.TURNED)
+        return FoundCameras(mapping=empty, unguided=empty, focal_source=source)
 
     def _best_start(self, tracks: Tracks) -> tuple[Mapping, FocalStart] | None:
         """The model that explains most, grown over the longest tracks; None if none has a point."""

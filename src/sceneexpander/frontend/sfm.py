@@ -43,6 +43,7 @@ from sceneexpander.frontend.sfm_types import (
     ViewReport,
 )
 from sceneexpander.frontend.threads import on_one_blas_thread
+from sceneexpander.frontend.turning import find_turn
 from sceneexpander.frontend.twoview import (
     PairMatches,
     fit_rotation,
@@ -59,6 +60,7 @@ __all__ = ["SfmConfig", "SfmReport", "SparseReconstruction", "ViewReport", "esti
 
 _SURE_OF_A_TURN = 50  # matches of descriptors that one rotation explains, for learned ones to have no say in it
 _MOST_MIRRORS = 4  # views without a camera that are tried mirrored
+_TURN_SIGMAS = 3.0  # standard deviations that the focal of a turning camera may be from what files or lines say
 _NEARBY = (1.0, 0.75, 1.33)  # focals to begin from, as factors of one that another model has found
 _NOTHING_SHARED = "no other photo shares enough with it"
 Judge = Callable[[SparseReconstruction], float]
@@ -305,6 +307,7 @@ class _Model:
     pairs: list[PairMatches]
     kinds: list[PairKind]
     mapping: Mapping
+    unguided: Mapping  # over the matches that were found before any camera was known
     focal_source: FocalSource
     distortion: Distortion | None  # what the keypoints were straightened by
 
@@ -343,7 +346,7 @@ def _model(
     found, narrowed = distortion, plan
     model = _solved(features, described, found, learned, known, narrowed, config, setup, pairs=pairs)
     for _ in range(config.distortion_rounds if plan.refine and not known.posed.any() else 0):
-        found = find_distortion(model.mapping, model.distortion)
+        found = find_distortion(model.unguided, model.distortion)
         if found is None:
             break
         ratio = float(found.intrinsics[plan.main, 0, 0] / plan.units_px[plan.main, 0])
@@ -371,18 +374,21 @@ def _solved(
     if pairs is None:
         pairs = _match_all(features, described, learned, config, setup)
     found = _pair_kinds(features, pairs, plan, config, setup, frozenset() if learned is None else learned.turns)
+    if not {PairKind.PARALLAX, PairKind.FLAT}.isdisjoint(found.kinds):
+        pairs, found = _without_false_parallax(features, pairs, found, plan, config, setup)
     search = CameraSearch(
         features=features, pairs=pairs, found=found, known=known, plan=plan, config=config, setup=setup
     )
-    mapping, source = search.run()
+    cameras = search.run()
     return _Model(
         raw=raw,
         described=described,
         features=features,
         pairs=pairs,
         kinds=found.kinds,
-        mapping=mapping,
-        focal_source=source,
+        mapping=cameras.mapping,
+        unguided=cameras.unguided,
+        focal_source=cameras.focal_source,
         distortion=distortion,
     )
 
@@ -514,6 +520,38 @@ def _pair_kinds(
         kinds.append(PairKind.ROTATION if rotation_only else _kind_of_motion(pair, features, config, setup))
     distinct = len(features) - sum(len(views) - 1 for views in group_alike(features, pairs, setup.unit_px))
     return PairKinds(kinds=kinds, distinct=distinct, turning_focal=float(np.median(factors)) if factors else None)
+
+
+def _without_false_parallax(
+    features: list[Features],
+    pairs: list[PairMatches],
+    found: PairKinds,
+    plan: LensPlan,
+    config: SfmConfig,
+    setup: Setup,
+) -> tuple[list[PairMatches], PairKinds]:
+    """(pairs, kinds): as they are, or those of a camera that only turned, without the matches that say otherwise."""
+    turn = find_turn(
+        features, pairs, plan.nominal, _turn_bounds(plan, config), config, unit_px=setup.unit_px, seed=setup.seed
+    )
+    if turn is None:
+        return pairs, found
+    _log.debug("the camera only turned, at a focal %.2f times the nominal one", turn.factor)
+    kinds = [PairKind.ROTATION if k in turn.pairs else kind for k, kind in enumerate(found.kinds)]
+    factor = turn.factor if plan.source is None else 1.0
+    return [turn.pairs.get(k, pair) for k, pair in enumerate(pairs)], replace(found, kinds=kinds, turning_focal=factor)
+
+
+def _turn_bounds(plan: LensPlan, config: SfmConfig) -> tuple[float, float]:
+    """Factors on the nominal focals that a turn may have: where something says the focal, what its uncertainty allows."""
+    if plan.known is not None:
+        return 1.0, 1.0
+    start, nominal = plan.starts[0], float(plan.nominal[plan.main, 0, 0] / plan.units_px[plan.main, 0])
+    if start.source is None:
+        low, high = config.focal_bounds
+        return low / nominal, high / nominal
+    spread = float(np.exp(_TURN_SIGMAS * start.sigma))
+    return start.ratio / nominal / spread, start.ratio / nominal * spread
 
 
 def _kind_of_motion(pair: PairMatches, features: list[Features], config: SfmConfig, setup: Setup) -> PairKind:

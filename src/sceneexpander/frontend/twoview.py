@@ -265,30 +265,50 @@ def fit_rotation(
     RANSAC over pairs of matches (two rays fix a rotation), refitted on the inliers (Kabsch).
     """
     count = len(xy_a)
-    rays_a, rays_b = homogeneous_rays(xy_a, intrinsics_a), homogeneous_rays(xy_b, intrinsics_b)
-    unit_a = rays_a / np.linalg.norm(rays_a, axis=1, keepdims=True)
-    unit_b = rays_b / np.linalg.norm(rays_b, axis=1, keepdims=True)
-    best, best_inlier = np.eye(3), np.zeros(count, bool)
+    best_inlier = np.zeros(count, bool)
     if count < 3:
-        return best, best_inlier
-
-    def agree(rotation: np.ndarray) -> np.ndarray:
-        moved = unit_a @ rotation.T
-        projected = moved @ intrinsics_b.T
-        error = np.linalg.norm(projected[:, :2] / np.maximum(projected[:, 2:], 1e-9) - xy_b, axis=1)
-        return (moved[:, 2] > 0) & (error < threshold_px)
-
+        return np.eye(3), best_inlier
+    unit_a, unit_b = unit_rays(xy_a, intrinsics_a), unit_rays(xy_b, intrinsics_b)
     for _ in range(60):
         sample = rng.choice(count, 3, replace=False)
-        inlier = agree(kabsch(unit_a[sample], unit_b[sample]))
+        rotation = kabsch(unit_a[sample], unit_b[sample])
+        inlier = rotation_errors_px(unit_a, xy_b, intrinsics_b, rotation) < threshold_px
         if inlier.sum() > best_inlier.sum():
             best_inlier = inlier
-    for _ in range(3):
-        if best_inlier.sum() < 3:
+    return refine_rotation(unit_a, unit_b, xy_b, intrinsics_b, best_inlier, threshold_px=threshold_px)
+
+
+def refine_rotation(
+    unit_a: Float[np.ndarray, "match 3"],
+    unit_b: Float[np.ndarray, "match 3"],
+    xy_b: Float[np.ndarray, "match 2"],
+    intrinsics_b: Float[np.ndarray, "3 3"],
+    inlier: Bool[np.ndarray, " match"],
+    *,
+    threshold_px: float,
+    rounds: int = 3,
+) -> tuple[Float[np.ndarray, "3 3"], Bool[np.ndarray, " match"]]:
+    """Rotation ``b_from_a`` fitted to the rays that agree (Kabsch), and who agrees with it then; ``rounds`` times over."""
+    rotation = np.eye(3)
+    for _ in range(rounds):
+        if inlier.sum() < 3:
             break
-        best = kabsch(unit_a[best_inlier], unit_b[best_inlier])
-        best_inlier = agree(best)
-    return best, best_inlier
+        rotation = kabsch(unit_a[inlier], unit_b[inlier])
+        inlier = rotation_errors_px(unit_a, xy_b, intrinsics_b, rotation) < threshold_px
+    return rotation, inlier
+
+
+def rotation_errors_px(
+    unit_a: Float[np.ndarray, "match 3"],
+    xy_b: Float[np.ndarray, "match 2"],
+    intrinsics_b: Float[np.ndarray, "3 3"],
+    rotation: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, " match"]:
+    """How far from where it was found each match lies in b if the camera only turned; inf if it would then be behind."""
+    moved = unit_a @ rotation.T
+    projected = moved @ intrinsics_b.T
+    error = np.linalg.norm(projected[:, :2] / np.maximum(projected[:, 2:], 1e-9) - xy_b, axis=1)
+    return np.where(moved[:, 2] > 0, error, np.inf)
 
 
 def homography_share(
@@ -299,15 +319,29 @@ def homography_share(
     seed: int,
 ) -> float:
     """Share of the matches that one homography takes to within ``threshold_px``; 0 without one."""
+    homography = fit_homography(xy_a, xy_b, threshold_px=threshold_px, seed=seed)
+    if homography is None:
+        return 0.0
+    return float((homography_errors_px(homography, xy_a, xy_b) < threshold_px).mean())
+
+
+def fit_homography(
+    xy_a: Float[np.ndarray, "match 2"], xy_b: Float[np.ndarray, "match 2"], *, threshold_px: float, seed: int
+) -> Float[np.ndarray, "3 3"] | None:
+    """The homography ``b_from_a`` of most matches; None without one."""
     if len(xy_a) < 8:
-        return 0.0
+        return None
     found = _robust_matrix(cv2.findHomography, xy_a, xy_b, usac_parameters(threshold_px, seed))
-    if found is None:
-        return 0.0
-    moved = np.concatenate([xy_a, np.ones((len(xy_a), 1))], 1) @ found[0].T
-    with np.errstate(divide="ignore", invalid="ignore"):  # points on the vanishing line agree with nothing
-        error = np.linalg.norm(moved[:, :2] / moved[:, 2:] - xy_b, axis=1)
-    return float((error < threshold_px).mean())
+    return None if found is None else found[0]
+
+
+def homography_errors_px(
+    homography: Float[np.ndarray, "3 3"], xy_a: Float[np.ndarray, "match 2"], xy_b: Float[np.ndarray, "match 2"]
+) -> Float[np.ndarray, " match"]:
+    """How far from where it was found each match lies in b; not finite on the homography's vanishing line."""
+    moved = np.concatenate([xy_a, np.ones((len(xy_a), 1))], 1) @ homography.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.linalg.norm(moved[:, :2] / moved[:, 2:] - xy_b, axis=1))
 
 
 def rotation_focal(
@@ -324,12 +358,9 @@ def rotation_focal(
     H = K R K^-1 holds for a turning camera alone, and fixes the focal length (Hartley, "Self-calibration of stationary cameras",
     1997). Searched on a logarithmic grid of 1.5 % within ``bounds``.
     """
-    if len(xy_a) < 8:
+    homography = fit_homography(xy_a, xy_b, threshold_px=threshold_px, seed=seed)
+    if homography is None or abs(np.linalg.det(homography)) < 1e-12:
         return None
-    found = _robust_matrix(cv2.findHomography, xy_a, xy_b, usac_parameters(threshold_px, seed))
-    if found is None or abs(np.linalg.det(found[0])) < 1e-12:
-        return None
-    homography = found[0]
     low, high = np.log(bounds)
     factors = np.exp(np.linspace(low, high, max(2, round((high - low) / 0.015))))
     residuals = []
@@ -361,6 +392,14 @@ def homogeneous_rays(
     x = (pixel_xy[:, 0] - intrinsics[0, 2]) / intrinsics[0, 0]
     y = (pixel_xy[:, 1] - intrinsics[1, 2]) / intrinsics[1, 1]
     return np.stack([x, y, np.ones_like(x)], 1)
+
+
+def unit_rays(
+    pixel_xy: Float[np.ndarray, "point 2"], intrinsics: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "point 3"]:
+    """Camera-frame rays of length 1."""
+    rays = homogeneous_rays(pixel_xy, intrinsics)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 def triangulate_pair(
