@@ -125,12 +125,14 @@ class _Pair:
         threshold_px: float,
         seed: int,
     ) -> _Pair | None:
-        """The pair as it is asked; None if its descriptors say too little."""
+        """The pair as it is asked; None if its descriptors say too little, or of no turn: words over all photos stay where they are."""
         a, b = features[pair.view_a], features[pair.view_b]
         verified = pair.verified.select(pair.verified.index_a < a.described)
         if verified.count < config.min_pair_inliers:
             return None
         xy_a, xy_b = a.pixel_xy[verified.index_a], b.pixel_xy[verified.index_b]
+        if np.median(np.linalg.norm(xy_a - xy_b, axis=1)) < threshold_px:
+            return None
         homography = fit_homography(xy_a, xy_b, threshold_px=threshold_px, seed=seed)
         if homography is None:
             return None

@@ -116,6 +116,13 @@ def test_a_known_focal_is_not_bent_to_make_a_turn(factor: float, turned: bool) -
     assert (turn_of(world, *matched(world), bounds=(factor, factor)) is not None) == turned
 
 
+def test_what_stays_where_it_is_tells_of_no_turn() -> None:
+    """Words over photos of different places."""
+    world = wall_world(turn=0.0)
+    world = replace(world, pixel_xy=world.pixel_xy[:, :1] + 0.3 * (world.pixel_xy - world.pixel_xy[:, :1] > 0))
+    assert turn_of(world, *matched(world, alike=0.1)) is None
+
+
 def test_learned_matches_are_not_asked_and_those_that_contradict_the_turn_go_too() -> None:
     world = wall_world()
     count = len(world.points)
