@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sceneexpander.artifacts.page import flatten
 from sceneexpander.artifacts.store import write_json_atomic
-from sceneexpander.config.files import read_yaml, write_yaml
+from sceneexpander.config.files import read_settings, write_settings
 from sceneexpander.files import directory_being_written
 from sceneexpander.pipeline.selection import Selection, read_selection
 from sceneexpander.report import MethodSource, RoundSource, SceneSource, collect_scene
@@ -62,7 +62,7 @@ def _gaussians(scene: str, selected: Selection) -> dict[str, str]:
 def main(cell: Cell) -> None:
     """List artefacts by what params.yaml selects: files of rounds or methods that were taken out may still lie there."""
     selected = read_selection(Path())
-    config = read_yaml(layout.config(cell.scene))
+    config = read_settings(layout.config(cell.scene))
     source = SceneSource(
         scene=layout.prepared(cell.scene),
         report=layout.state(cell.scene, 0) / "report.json",
@@ -79,7 +79,7 @@ def main(cell: Cell) -> None:
     with directory_being_written(layout.PAGES / cell.scene) as folder:
         collect_scene(source, folder)
         # For the recording, which depends on the gathered folders alone.
-        write_yaml(folder / layout.PAGE_CONFIG, config)
+        write_settings(folder / layout.PAGE_CONFIG, config)
         write_json_atomic(folder / layout.PAGE_GAUSSIANS, _gaussians(cell.scene, selected))
 
 

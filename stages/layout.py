@@ -11,7 +11,7 @@ from sceneexpander.pipeline.unasked import METHODS_FILE
 SCENES = Path("scenes")
 OUTPUTS = Path("outputs")
 PAGES = OUTPUTS / "pages"  # what is shown of every scene, gathered from its artefacts
-PAGE_CONFIG = "config.yaml"  # in a scene's folder of PAGES: its composed configuration
+PAGE_CONFIG = "config.json"  # in a scene's folder of PAGES: its composed configuration
 PAGE_GAUSSIANS = "gaussians.json"  # there as well: hashes of the Gaussians' files, which are too large to be gathered
 REPORT = OUTPUTS / "report"
 CODE = OUTPUTS / "code.json"
@@ -34,7 +34,7 @@ def source(scene: str) -> Path:
 
 def config(scene: str) -> Path:
     """The composed configuration."""
-    return OUTPUTS / scene / "config.yaml"
+    return OUTPUTS / scene / "config.json"
 
 
 def selection(scene: str) -> Path:
@@ -63,7 +63,7 @@ def asked(scene: str, number: int) -> Path:
 
 def round_settings(scene: str) -> Path:
     """How the picture of each round is obtained: sections by `round_key`, apart from `config` so that rounds share nothing here."""
-    return OUTPUTS / scene / "rounds.yaml"
+    return OUTPUTS / scene / "rounds.json"
 
 
 def round_key(number: int) -> str:

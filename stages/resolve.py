@@ -9,7 +9,7 @@ from typing import Any
 
 from sceneexpander.catalogue.methods import known_methods
 from sceneexpander.config.compose import compose, scene_option
-from sceneexpander.config.files import write_yaml
+from sceneexpander.config.files import write_settings
 from sceneexpander.config.overrides import written_out
 from sceneexpander.generation.config import ChoiceConfig, GeneratorConfig
 from sceneexpander.judge.config import JudgeConfig
@@ -80,19 +80,19 @@ def main(cell: Cell) -> None:
     overrides = [f"scene={scene_option(CONF, cell.scene)}", *read_overrides(Path("params.yaml"))]
     values = compose(CONF, overrides)
     values["threads"] = values["threads"] or usable_cpus()
-    write_yaml(layout.config(cell.scene), values)
+    write_settings(layout.config(cell.scene), values)
     rounds = []
     for number in range(1, selected.rounds + 1):
         more = written_out(selected.overrides_of(number))
         of_round = compose(CONF, [*overrides, *more]) if more else values
         rounds.append({name: of_round[name] for name in ROUND_SECTIONS})
     keys = map(layout.round_key, range(1, len(rounds) + 1))
-    write_yaml(layout.round_settings(cell.scene), dict(zip(keys, rounds, strict=True)))
+    write_settings(layout.round_settings(cell.scene), dict(zip(keys, rounds, strict=True)))
     for kind in ("generator", "choice"):
         shutil.rmtree(layout.given(cell.scene, kind), ignore_errors=True)  # of rounds that are no more
     for kind, files in named_files(values, rounds).items():
         link_files(files, layout.given(cell.scene, kind))
-    write_yaml(
+    write_settings(
         layout.selection(cell.scene),
         {method.name: method.name in methods for method in known_methods() if not method.always_made},
     )

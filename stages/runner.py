@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sceneexpander.artifacts.store import keep_newest, read_json, write_json_atomic
-from sceneexpander.config.files import read_yaml
+from sceneexpander.config.files import read_settings
 from sceneexpander.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, UserError, disk_full, interruptible
 from sceneexpander.files import write_bytes_atomic
 from sceneexpander.pipeline.packages import installed_packages
@@ -196,7 +196,7 @@ def left_out(cell: Cell) -> bool:
 
     `sceneexpander.pipeline.unasked` does the same without a process; this is for stages that something else starts, e.g. ``dvc repro``.
     """
-    if read_yaml(layout.selection(cell.scene))[cell.method]:
+    if read_settings(layout.selection(cell.scene))[cell.method]:
         return False
     write_unasked(cell.method, layout.reconstruction(cell.scene, cell.round, cell.method).parent)
     return True

@@ -71,8 +71,8 @@ def test_every_picture_is_asked_for_once(project: Project, service: Service) -> 
 
 
 def test_a_killed_stage_goes_on_with_what_came(project: Project, service: Service) -> None:
-    settings = project.folder / "outputs" / "room" / "rounds.yaml"
-    settings.write_text(settings.read_text().replace("take: 0", "take: 1"))
+    settings = project.folder / "outputs" / "room" / "rounds.json"
+    settings.write_text(settings.read_text().replace('"take": 0', '"take": 1'))
     before = len(service.asked)
     service.answers[1].wait_s = 5.0
     command = [sys.executable, "-m", "stages.generate_view", "room", "1", "0"]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from sceneexpander.catalogue.metrics import metrics_named
-from sceneexpander.evaluation.image import psnr
 from sceneexpander.evaluation.measure import Measure, Subject, Values, shows_enough
-from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 
 
 class EarlierRegions(Measure):
@@ -26,7 +24,7 @@ class EarlierRegions(Measure):
             later = round_of[made.view_ids[view.index]] >= subject.round_number
             if not bool(made.posed[view.index]) or (view.generated and later) or not shows_enough(view):
                 continue
-            value = min(psnr(view.render.rgb[0], view.picture, view.valid), PSNR_CAP_DB)
+            value = view.likeness.psnr_db
             (inserted if view.generated else captured).append(value)
         return {
             "psnr_earlier_inserted_db": sum(inserted) / len(inserted) if inserted else None,

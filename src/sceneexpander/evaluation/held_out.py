@@ -27,7 +27,8 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.catalogue import Views, metric_named
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
-from sceneexpander.evaluation.image import psnr, ssim
+from sceneexpander.evaluation.image import psnr
+from sceneexpander.evaluation.likeness import PSNR_CAP_DB, compare_pictures
 from sceneexpander.evaluation.measure import (
     FEWEST_PIXELS,
     Measure,
@@ -37,8 +38,6 @@ from sceneexpander.evaluation.measure import (
     known_values,
     shows_enough,
 )
-from sceneexpander.evaluation.perceptual import st_lpips
-from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.frontend.resection import Sighting, resect, solve_pose
 from sceneexpander.frontend.sfm_types import REFERENCE_LONG_SIDE_PX, SfmConfig
 from sceneexpander.frontend.twoview import homogeneous_rays
@@ -244,10 +243,11 @@ class Unseen(Measure):
             torch.ones_like(alpha, dtype=torch.bool) if view.valid is None else view.valid
         )
         covered = (alpha > view.config.coverage_alpha) & counted
+        like = compare_pictures(rgb, view.picture, view.valid, perceptual=view.config.st_lpips)
         return {
-            "psnr_held_out_db": min(psnr(rgb, view.picture, counted), PSNR_CAP_DB),
-            "ssim_held_out": ssim(rgb, view.picture, counted),
-            "st_lpips_held_out": st_lpips(rgb * counted, view.picture * counted) if view.config.st_lpips else None,
+            "psnr_held_out_db": like.psnr_db,
+            "ssim_held_out": like.ssim,
+            "st_lpips_held_out": like.st_lpips,
             "held_out_covered": float(covered[counted].double().mean()),
             "psnr_held_out_covered_db": (
                 min(psnr(rgb, view.picture, covered), PSNR_CAP_DB) if int(covered.sum()) >= FEWEST_PIXELS else None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 from jaxtyping import Bool, Float
@@ -19,6 +20,7 @@ from sceneexpander.artifacts.truth import SceneTruth
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.catalogue import Metric
 from sceneexpander.evaluation.config import EvaluateConfig
+from sceneexpander.evaluation.likeness import Likeness, compare_pictures
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import Render
 
@@ -26,7 +28,7 @@ FEWEST_PIXELS = 64  # fewer say nothing about a picture or a region
 Values = Mapping[str, float | None]  # by names of the catalogue; None: not defined here
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class SeenView:
     """One view of a reconstruction and what its own camera sees of it.
 
@@ -52,6 +54,11 @@ class SeenView:
     def generated(self) -> bool:
         """Whether it is an inserted view: metrics of captured and of inserted views have different names."""
         return bool(self.reconstruction.generated[self.index])
+
+    @cached_property
+    def likeness(self) -> Likeness:
+        """Of the render and the picture at the stored size: compared once, whoever asks."""
+        return compare_pictures(self.render.rgb[0], self.picture, self.valid, perceptual=self.config.st_lpips)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,16 +16,14 @@ from torch.nn import functional
 from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
-from sceneexpander.evaluation.image import WINDOW, psnr, ssim
+from sceneexpander.evaluation.image import WINDOW
+from sceneexpander.evaluation.likeness import compare_pictures
 from sceneexpander.evaluation.measure import Measure, SeenView, Values
-from sceneexpander.evaluation.perceptual import st_lpips
 from sceneexpander.geometry.camera import resize_intrinsics
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import render
 
 OPEN_ALPHA = 0.9  # below it one looks through a surface
-PSNR_CAP_DB = 100.0
-_LEAST_SIDE_PX = 28  # smaller pictures vanish inside the network of ST-LPIPS
 _TIMES = {"half": 0.5, "double": 2.0, "quadruple": 4.0}
 # Of each size the end of its metrics' names.
 _CAPTURED = {
@@ -112,16 +110,20 @@ def _at_size(
     wanted = photo
     if size != tuple(photo.shape[1:]):
         wanted = functional.interpolate(photo[None], size=size, mode="bicubic", antialias=True)[0].clamp(0, 1)
-    picture = seen.rgb[0]
-    distance = None
-    if perceptual and min(size) >= _LEAST_SIDE_PX:
-        everywhere = 1.0 if shown is None else shown
-        distance = st_lpips(picture * everywhere, wanted * everywhere)
+    like = compare_pictures(seen.rgb[0], wanted, shown, perceptual=perceptual)
+    return SizeMetrics(open_share=open_share, psnr_db=like.psnr_db, ssim=like.ssim, st_lpips=like.st_lpips)
+
+
+def _as_stored(view: SeenView) -> SizeMetrics | None:
+    """The numbers at the photo's own size if the photo is the stored picture: they are those of the stored size."""
+    if view.photo.shape != view.picture.shape or not torch.equal(view.photo, view.picture):
+        return None
+    through, like = view.render.alpha[0] < OPEN_ALPHA, view.likeness
     return SizeMetrics(
-        open_share=open_share,
-        psnr_db=min(psnr(picture, wanted, shown), PSNR_CAP_DB),
-        ssim=ssim(picture, wanted, shown),
-        st_lpips=distance,
+        open_share=float((through if view.valid is None else through[view.valid]).double().mean()),
+        psnr_db=like.psnr_db,
+        ssim=like.ssim,
+        st_lpips=like.st_lpips,
     )
 
 
@@ -140,7 +142,9 @@ class AtOtherSizes(Measure):
     def of_view(self, view: SeenView) -> Values:
         """The numbers of every size that is large enough."""
         names = _INSERTED if view.generated else _CAPTURED
-        found = at_sizes(view.reconstruction, view.index, view.photo, view.valid, view.config, tuple(names))
+        known = {} if (stored := _as_stored(view)) is None else {"own": stored}
+        left = tuple(name for name in names if name not in known)
+        found = known | at_sizes(view.reconstruction, view.index, view.photo, view.valid, view.config, left)
         values: dict[str, float | None] = {}
         for size, measured in found.items():
             where = names[size]

@@ -17,8 +17,8 @@ from sceneexpander.artifacts.truth import SceneTruth, ViewTruth, check_size
 from sceneexpander.artifacts.views import ViewRecord, ViewSet
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.image import WINDOW, psnr, ssim
+from sceneexpander.evaluation.likeness import PSNR_CAP_DB
 from sceneexpander.evaluation.measure import FEWEST_PIXELS, Measure, Subject, Values
-from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.geometry.camera import pixel_centres
 from sceneexpander.geometry.rigid import rigid_inverse, rotation_angle_deg
 from sceneexpander.geometry.similarity import umeyama

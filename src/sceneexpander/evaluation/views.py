@@ -23,7 +23,8 @@ from sceneexpander.catalogue import Views, metric_named
 from sceneexpander.catalogue.metrics import metrics_named
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.ghosting import find_ghosting
-from sceneexpander.evaluation.image import psnr, ssim
+from sceneexpander.evaluation.image import psnr
+from sceneexpander.evaluation.likeness import PSNR_CAP_DB
 from sceneexpander.evaluation.measure import (
     FEWEST_PIXELS,
     Measure,
@@ -33,8 +34,6 @@ from sceneexpander.evaluation.measure import (
     known_values,
     shows_enough,
 )
-from sceneexpander.evaluation.perceptual import st_lpips
-from sceneexpander.evaluation.sizes import PSNR_CAP_DB
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.gaussians import Gaussians
 from sceneexpander.geometry.similarity import align_views
@@ -193,16 +192,16 @@ class AtStoredSize(Measure):
 
     def of_view(self, view: SeenView) -> Values:
         """All of the view's kind."""
-        rgb, alpha = view.render.rgb[0], view.render.alpha[0]
+        like, alpha = view.likeness, view.render.alpha[0]
         counted = _counted(view)
         covered = (alpha > view.config.coverage_alpha) & counted
         depth = view.reconstruction.depth[view.index]
         relative = (view.render.depth[0] - depth).abs()[covered] / depth[covered]
         generated = view.render.generated[0]
         values = (
-            min(psnr(rgb, view.picture, view.valid), PSNR_CAP_DB),
-            ssim(rgb, view.picture, view.valid),
-            st_lpips(rgb * counted, view.picture * counted) if view.config.st_lpips else None,
+            like.psnr_db,
+            like.ssim,
+            like.st_lpips,
             _share(covered, counted),
             float((generated * alpha)[counted].sum() / alpha[counted].sum().clamp(min=1e-12)),
             float(relative.median()) if len(relative) else None,

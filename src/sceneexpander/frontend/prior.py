@@ -17,6 +17,7 @@ from sceneexpander.frontend.sfm import Judge, estimate_cameras
 from sceneexpander.frontend.sfm_types import FocalSource, SfmConfig, SparseReconstruction
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.priors import Priors
+from sceneexpander.geometry.similarity import align_poses
 
 _JUDGE_PX = 240  # long side at which camera models are compared; half the pixels of the full size
 
@@ -44,8 +45,9 @@ def build_priors(
     optics: Sequence[ViewOptics] | None = None,
     valid: Bool[Tensor, "view height width"] | None = None,
     memory: MatchMemory | None = None,
+    settled: SettledCameras | None = None,
 ) -> tuple[Priors, SparseReconstruction]:
-    """Everything a reconstructor can be told about S >= 1 views; arguments as in `sfm.estimate_cameras`.
+    """Everything a reconstructor can be told about S >= 1 views; arguments as in `sfm.estimate_cameras` and `keep_settled`.
 
     World frame: view 0's camera. Scale: the median of view 0's dense depth is 1, for poses, points and depth together. ``known_depth``
     (in the unit of the known poses; 0 where there is none) takes the place of matched depth where it agrees with it.
@@ -64,6 +66,8 @@ def build_priors(
         memory=memory,
         judge=picture_judge(images, config.dense),
     )
+    if settled is not None:
+        sparse = keep_settled(sparse, settled)
     dense = dense_depth(
         straighten(images, sparse)[0],
         cameras_of(sparse, images),
@@ -88,6 +92,52 @@ def build_priors(
         posed=sparse.posed,
     )
     return priors, sparse
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SettledCameras:
+    """Cameras of the first views as they were found before, in any frame and unit, and which of them are not to be found anew."""
+
+    world_from_cam: Float[Tensor, "settled 4 4"]
+    intrinsics_px: Float[Tensor, "settled 3 3"]
+    posed: Bool[Tensor, "settled"]
+    kept: Bool[Tensor, "settled"]
+
+
+def keep_settled(sparse: SparseReconstruction, settled: SettledCameras) -> SparseReconstruction:
+    """The reconstruction with the cameras that are kept where they were, relative to all others with a pose then and now.
+
+    A picture that was inserted and need not agree with the place takes part in what is estimated next, and so do pictures that were drawn
+    of it: its camera would follow whatever they have in common. As it was when all was made from it, it shows what it showed. Its
+    observations go: they belong to another camera. Fewer than two others, or others all in one place: nothing is changed.
+    """
+    count = len(settled.kept)
+    posed = settled.posed.to(sparse.posed.device)
+    anchors = torch.nonzero(sparse.posed[:count] & posed & ~settled.kept)[:, 0]
+    kept = torch.nonzero(settled.kept & posed)[:, 0]
+    if len(anchors) < 2 or len(kept) == 0:
+        return sparse
+    try:
+        similarity = align_poses(settled.world_from_cam[anchors], sparse.world_from_cam[anchors])
+    except ValueError:  # they stand in one place: no scale
+        return sparse
+    poses, lenses, found = sparse.world_from_cam.clone(), sparse.intrinsics_px.clone(), sparse.posed.clone()
+    poses[kept] = similarity.poses(settled.world_from_cam[kept]).to(poses)
+    lenses[kept], found[kept] = settled.intrinsics_px[kept].to(lenses), True
+    points = sparse.sparse
+    left = ~torch.isin(points.view_index, kept)
+    return replace(
+        sparse,
+        world_from_cam=poses,
+        intrinsics_px=lenses,
+        posed=found,
+        sparse=replace(
+            points,
+            view_index=points.view_index[left],
+            point_index=points.point_index[left],
+            pixel_xy=points.pixel_xy[left],
+        ),
+    )
 
 
 def picture_judge(images: Float[Tensor, "view 3 height width"], dense: DenseConfig) -> Judge:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from sceneexpander.frontend.bundle import LOG_FOCAL, Lenses
-from sceneexpander.frontend.evidence import halves_apart_deg, rival_angle_deg
+from sceneexpander.frontend.evidence import rival_angle_deg
 from sceneexpander.frontend.features import Features
 from sceneexpander.frontend.lens_tests import (
     doubt_focal,
@@ -95,19 +95,17 @@ class CameraSearch:
             again = build_tracks(self.features, self._guided_pairs(model))
             guided = self._new_mapping(again, start)
             guided.adopt(model)
-            guided.grow(refine_focal=False, free=self._free_views(guided))
+            guided.grow(refine_focal=False, free=self.free_views(guided))
             refine = self._finish(guided, refine)
             model = guided
         if start.source is not None and self.plan.refine:
             before = model.over(tracks)
-            before.finish(refine_focal=False, free=self._free_views(model))
+            before.finish(refine_focal=False, free=self.free_views(model))
             other = doubt_focal(before)
             if other is not None:
                 model.rival_log_focal = float(other.log_focal[model.main])
                 model.spread_deg = np.maximum(model.spread_deg, directions_between_deg(before, [other]))
-        if refine:  # with a focal that is held and a little wrong, halves differ by that
-            apart = halves_apart_deg(model, tracks, self._free_views(model))
-            model.halves_deg = np.where(self.plan.generated, 0.0, apart)  # whether those fit is asked elsewhere
+        if refine:
             return FoundCameras(mapping=model, unguided=unguided, focal_source=FocalSource.REFINED)
         if self.plan.refine:
             others = [self._moved(model, sign * start.sigma) for sign in (-1, 1)]
@@ -156,7 +154,7 @@ class CameraSearch:
             return None
         enough = self.found.distinct >= self.config.min_views_for_focal
         refine = self.plan.refine and (enough or self._hinted(start))
-        candidate.grow(refine_focal=refine, free=self._free_views(candidate))
+        candidate.grow(refine_focal=refine, free=self.free_views(candidate))
         return candidate
 
     def _hinted(self, start: FocalStart) -> bool:
@@ -167,7 +165,7 @@ class CameraSearch:
         """(finished model over all tracks with its lenses tested, its start, whether its main focal was refined, and was to be)."""
         model = self._new_mapping(tracks, start)
         model.adopt(grown)
-        free = self._free_views(model)
+        free = self.free_views(model)
         model.grow(refine_focal=False, free=free)
         several = min(int(model.registered.sum()), self.found.distinct) >= self.config.min_views_for_focal
         attempted = self.plan.refine and (several or self._hinted(start))
@@ -226,7 +224,7 @@ class CameraSearch:
         """The model settled at another main focal, which is held."""
         other = model.copy()
         other.move_main_focal(jump)
-        other.finish(refine_focal=False, free=self._free_views(other))
+        other.finish(refine_focal=False, free=self.free_views(other))
         return other
 
     def _with_groups_apart(self, tracks: Tracks, model: Mapping) -> Mapping:
@@ -329,7 +327,7 @@ class CameraSearch:
 
     def _finish(self, mapping: Mapping, refine: bool) -> bool:
         """Finish a model; a main focal that turns out too uncertain falls back to its prior. Returns whether it was refined."""
-        free = self._free_views(mapping)
+        free = self.free_views(mapping)
         mapping.finish(refine_focal=refine, free=free)
         main = mapping.lens_of[mapping.main]
         if refine and mapping.lens_sigma[main, LOG_FOCAL] > self.config.max_focal_sigma:
@@ -364,7 +362,7 @@ class CameraSearch:
         mapping.translations[:] = self.known.cam_from_world[:, :3, 3]
         mapping.registered = self.known.posed.copy()
 
-    def _free_views(self, mapping: Mapping) -> Bool[np.ndarray, " view"] | None:
+    def free_views(self, mapping: Mapping) -> Bool[np.ndarray, " view"] | None:
         """Cameras that adjustment may move; None leaves the choice of the reference to the mapping."""
         if not self.known.posed.any():
             return None

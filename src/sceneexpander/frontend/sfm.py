@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sceneexpander.frontend.appearance import find_overlay, group_alike, looks_mirrored, patch_agreement
 from sceneexpander.frontend.distortion import Distortion
-from sceneexpander.frontend.evidence import ViewEvidence, common_doubt, weigh_evidence
+from sceneexpander.frontend.evidence import ViewEvidence, common_doubt, halves_apart_deg, weigh_evidence
 from sceneexpander.frontend.features import Features, lie_in
 from sceneexpander.frontend.known_check import compare_with_matches
 from sceneexpander.frontend.lens_tests import find_distortion, rival_lens_deg
@@ -144,13 +144,14 @@ def estimate_cameras(
     choosing = config.learned is LearnedUse.CHOOSE and 1 < len(setup.greys) <= config.choose_most_views
     if choosing and judge is not None and not known.posed.all():
         candidates = [model, *_learned_models(model, (False, True), known, plan, config, setup, memory)]
-        finished = [_reconstruction(candidate, plan, config, setup) for candidate in candidates]
-        if len(finished) == 1:
-            return finished[0]
-        verdicts = [(int(candidate.posed.sum()), judge(candidate)) for candidate in finished]
-        best = max(range(len(finished)), key=lambda k: verdicts[k])
-        _log.info("camera models: (views posed, share that fits) %s, number %d taken", verdicts, best)
-        return finished[best]
+        if len(candidates) > 1:
+            # Halves only raise doubts: a verdict takes no notice of them, and they cost as much as a model.
+            finished = [_reconstruction(candidate, plan, config, setup, halves=False) for candidate in candidates]
+            verdicts = [(int(candidate.posed.sum()), judge(candidate)) for candidate in finished]
+            best = max(range(len(finished)), key=lambda k: verdicts[k])
+            _log.info("camera models: (views posed, share that fits) %s, number %d taken", verdicts, best)
+            model = candidates[best]
+        return _reconstruction(model, plan, config, setup)
     if config.learned is LearnedUse.ALWAYS or (config.learned is not LearnedUse.NEVER and model.left_out.any()):
         for joined in _learned_models(model, (False,), known, plan, config, setup, memory):
             if config.learned is LearnedUse.ALWAYS or joined.left_out.sum() < model.left_out.sum():
@@ -193,13 +194,22 @@ def _match_all(
     ]
 
 
-def _reconstruction(model: _Model, plan: LensPlan, config: SfmConfig, setup: Setup) -> SparseReconstruction:
-    """A finished model with all views placed and their evidence weighed, in the form that the outside knows."""
+def _reconstruction(
+    model: _Model, plan: LensPlan, config: SfmConfig, setup: Setup, *, halves: bool = True
+) -> SparseReconstruction:
+    """A finished model with all views placed and their evidence weighed (``halves``: also by two halves of the matches).
+
+    In the form that the outside knows.
+    """
     mapping = model.mapping.copy()
     hinted = np.isfinite(plan.focal_hints[plan.lens_of]).tolist()
     evidence: dict[int, ViewEvidence] = {}
     refused: dict[int, str] = {}
     if mapping.valid.any() and plan.known is None:
+        # With a main focal that is held and a little wrong, halves differ by that.
+        if halves and model.focal_source is FocalSource.REFINED:
+            apart = halves_apart_deg(mapping, model.unguided.tracks, model.free)
+            mapping.halves_deg = np.where(plan.generated, 0.0, apart)  # whether those fit is asked elsewhere
         mapping.spread_deg = np.maximum(mapping.spread_deg, rival_lens_deg(mapping, model.features, model.pairs))
         evidence = weigh_evidence(mapping, model.features, model.pairs, hinted)
         # A generated picture need not agree with the place: whether it fits is asked elsewhere, with what it is for in mind.
@@ -310,6 +320,7 @@ class _Model:
     unguided: Mapping  # over the matches that were found before any camera was known
     focal_source: FocalSource
     distortion: Distortion | None  # what the keypoints were straightened by
+    free: Bool[np.ndarray, " view"] | None  # cameras that adjustment may move; None: all but the reference
 
     @property
     def left_out(self) -> Bool[np.ndarray, " view"]:
@@ -390,6 +401,7 @@ def _solved(
         unguided=cameras.unguided,
         focal_source=cameras.focal_source,
         distortion=distortion,
+        free=search.free_views(cameras.mapping),
     )
 
 

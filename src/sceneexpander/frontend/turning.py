@@ -81,23 +81,23 @@ def find_turn(
         found = _Pair.make(features, pair, intrinsics, config, threshold_px=threshold, seed=seed)
         if found is not None:
             asked[place] = found
-    verified = sum(pair.verified.count for pair in asked.values())
-    by_homography = sum(int(pair.explained.sum()) for pair in asked.values())
+    verified = sum(own.verified.count for own in asked.values())
+    by_homography = sum(int(own.explained.sum()) for own in asked.values())
     if not asked or by_homography < _MOST * verified:
         return None
     factor = _find_factor(list(asked.values()), bounds, threshold)
-    fits = {place: pair.fit(factor, threshold) for place, pair in asked.items()}
+    fits = {place: own.fit(factor, threshold) for place, own in asked.items()}
     by_turn = sum(count for _, count in fits.values())
     if by_turn < max(_AS_MUCH * by_homography, _MOST * verified):
         return None
     agree = open_to_all = 0
     narrowed: dict[int, PairMatches] = {}
-    for place, pair in asked.items():
+    for place, own in asked.items():
         rotation = fits[place][0]
-        agree += int((pair.errors_px(pair.verified, factor, rotation) >= far).sum())
-        open_to_all += int((pair.errors_px(pair.tentative, factor, rotation) >= far).sum())
+        agree += int((own.errors_px(own.verified, factor, rotation) >= far).sum())
+        open_to_all += int((own.errors_px(own.tentative, factor, rotation) >= far).sum())
         every = pairs[place].verified
-        kept = every.select(pair.errors_px(every, factor, rotation) < far)
+        kept = every.select(own.errors_px(every, factor, rotation) < far)
         narrowed[place] = replace(pairs[place], verified=kept)
     return None if agree >= _LEFT_AGREE * max(open_to_all, 1) else Turn(factor=factor, pairs=narrowed)
 

@@ -48,6 +48,9 @@ class RefineConfig:
     exposures: Rate = 1e-2  # of each photo's gains and offsets; 0: photos are taken to be exposed alike
     ssim_weight: Share = 0.2  # of 1 - SSIM beside the mean absolute error
     solid_weight: Weight = 0.2  # of the light that passes through what a picture shows
+    colour_prior: Weight = (
+        50.0  # of the mean squared distance of colours from the model's, each as its own photo was exposed
+    )
 
     def __post_init__(self) -> None:
         check_ranges(self)

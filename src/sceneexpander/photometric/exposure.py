@@ -7,7 +7,7 @@ CVPR 2021) every photo has an appearance of its own, here a gain and an offset p
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 _PRICE = 0.1  # of the mean square of logarithms of gains and of offsets: what explains nothing stays at 1 and 0
@@ -37,6 +37,18 @@ class Exposures:
             return rgb
         log_gain, offset = self._change[view] - self._change[self._photos].mean(0)
         return rgb * log_gain.exp()[:, None, None] + offset[:, None, None]
+
+    def applied_to_each(
+        self, colours: Float[Tensor, "gaussian 3"], source_view: Int[Tensor, " gaussian"]
+    ) -> Float[Tensor, "gaussian 3"]:
+        """Colours of Gaussians as the photo that each was made from would have taken them. The exposures learn nothing from it."""
+        if not self._photos:
+            return colours
+        change = torch.zeros_like(self._change)
+        change[self._photos] = (self._change[self._photos] - self._change[self._photos].mean(0)).detach()
+        log_gain, offset = change.unbind(1)
+        # Several times as fast as indexing, and there are as many Gaussians as pixels.
+        return colours * log_gain.exp().index_select(0, source_view) + offset.index_select(0, source_view)
 
     def penalty(self) -> Float[Tensor, ""]:
         """For the loss."""

@@ -6,6 +6,11 @@ them (docs/refinement.md). The pictures are taken at several sizes, that of the 
 time, and no Gaussian gets narrower than what its finest view resolves: so the scene holds at other distances, too. What photos differ in
 by their exposure is left to them (`Exposures`). Cameras, depth and normals stay as the model made them, and no Gaussian comes or goes:
 longer optimisation with densification is `sceneexpander.optimisation.optimise`.
+
+Two things keep it from learning the photos by heart, which costs places seen from elsewhere. Where Gaussians overlap, a picture is a
+mixture of their colours, and a fit that is free undoes the mixture: colours add up to the photo from its own camera, and only there. So a
+colour has a price for its distance from the model's. And in one visit of four a photo has to be shown by the Gaussians of the others, as
+any new picture has to be.
 """
 
 from __future__ import annotations
@@ -15,10 +20,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.geometry.gaussians import rgb_from_sh
 from sceneexpander.geometry.randomness import child_generator
 from sceneexpander.geometry.rigid import rigid_inverse
 from sceneexpander.optimisation.config import RatesConfig
@@ -31,6 +37,9 @@ from sceneexpander.photometric.report import FitReport
 from sceneexpander.splatting import RasterSettings, rasterise
 
 _LAST_RATE = 0.05  # of the first, reached along a cosine
+_TURNS = 4  # after so many visits the sizes come again
+_OTHERS_TURN = 3  # of these: the view's own Gaussians stay away
+_COVERED = 0.5  # alpha from which on a pixel of that counts
 _COMPENSATED = RasterSettings(antialiased=True)
 
 
@@ -81,8 +90,7 @@ def refine(
         turn, place = divmod(step, len(targets))
         order = torch.randperm(len(targets), generator=child_generator(seed, f"refine/{turn}"))
         background = torch.rand(3, generator=child_generator(seed, f"refine/background/{step}"))
-        picture = fit.picture(targets[int(order[place])], turn)
-        loss = fit.step(targets[int(order[place])], picture, background, step / steps)
+        loss = fit.step(targets[int(order[place])], turn, background, step / steps)
         if on_step is not None:
             on_step(step + 1, loss)
     report = FitReport(steps=steps, before=before, after=fit.mean_loss(targets))
@@ -124,18 +132,22 @@ class _Fit:
             finest=pictures.finest_pixel(gaussians.means, world_from_cam, targets),
         )
         self._rates = {name: o.param_groups[0]["lr"] for name, o in self.splats.optimisers.items()}
+        self._colour_prior = config.colour_prior
+        self._first_colours = self._colours().detach().clone()
 
-    def picture(self, view: int, turn: int) -> Picture:
-        """What a view is compared with in one of its visits: sizes take turns."""
-        return (self._pictures.own, self._pictures.stored, self._pictures.own, self._pictures.half)[turn % 4](view)
-
-    def step(self, view: int, picture: Picture, background: Float[Tensor, "3"], progress: float) -> float:
-        """One view, one update; ``progress`` in [0, 1) says how far the rates have fallen."""
+    def step(self, view: int, turn: int, background: Float[Tensor, "3"], progress: float) -> float:
+        """One view, one update: its visit number ``turn``; ``progress`` in [0, 1) says how far the rates have fallen."""
+        size = turn % _TURNS
+        picture = (self._pictures.own, self._pictures.stored, self._pictures.own, self._pictures.half)[size](view)
         share = max(0.5 * (1 + math.cos(math.pi * progress)), _LAST_RATE)
         for name, optimiser in self.splats.optimisers.items():
             optimiser.param_groups[0]["lr"] = self._rates[name] * share
-        loss = self._loss(view, picture, background)
-        (loss + self._exposures.penalty()).backward()  # type: ignore[no-untyped-call]
+        others = self.splats.params["source_view"] != view if size == _OTHERS_TURN else None
+        if others is not None and bool(others.any()):
+            loss = self._loss_of_others(view, picture, others)
+        else:
+            loss = self._loss(view, picture, background)
+        (loss + self._exposures.penalty() + self._distance_from_model()).backward()  # type: ignore[no-untyped-call]
         self.splats.step()
         self._exposures.step(share)
         return float(loss.detach())
@@ -147,12 +159,32 @@ class _Fit:
         return float(torch.stack([self._loss(view, self._pictures.own(view), grey) for view in views]).mean())
 
     def _loss(self, view: int, picture: Picture, background: Float[Tensor, "3"]) -> Float[Tensor, ""]:
+        rgb, alpha = self._seen(view, picture, self.splats.opacities, background)
+        through = 1 - alpha
+        if picture.weights is not None:
+            through = through * picture.weights
+        return self._photometric(view, rgb, picture.rgb, picture.weights) + self._solid * through.mean()
+
+    def _loss_of_others(self, view: int, picture: Picture, others: Bool[Tensor, " gaussian"]) -> Float[Tensor, ""]:
+        """Of what the other views' Gaussians show of a picture, where they cover it: what they leave open is not theirs to close."""
+        opacities = self.splats.opacities * others
+        rgb, alpha = self._seen(view, picture, opacities, torch.zeros(3))
+        weights = (alpha.detach() > _COVERED).to(rgb)
+        if picture.weights is not None:
+            weights = weights * picture.weights
+        # The colour of what is there, not of the black behind it.
+        return self._photometric(view, rgb / alpha.clamp(min=_COVERED), picture.rgb, weights)
+
+    def _seen(
+        self, view: int, picture: Picture, opacities: Float[Tensor, " gaussian"], background: Float[Tensor, "3"]
+    ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"]]:
+        """Colours before a background, and alpha, at the size of a picture."""
         splats = self.splats
         seen = rasterise(
             splats.params["means"],
             splats.params["quats"],
             splats.scales,
-            splats.opacities,
+            opacities,
             splats.colours(self._degree),
             self._cam_from_world[view : view + 1],
             picture.intrinsics_px[None],
@@ -162,12 +194,25 @@ class _Fit:
             with_depth=False,
             settings=_COMPENSATED,
         )
-        through = 1 - seen.alpha[0]
-        if picture.weights is not None:
-            through = through * picture.weights
-        return (
-            photometric_loss(
-                self._exposures.applied(seen.rgb[0], view), picture.rgb, self._ssim_weight, picture.weights
-            )
-            + self._solid * through.mean()
-        )
+        return seen.rgb[0], seen.alpha[0]
+
+    def _photometric(
+        self,
+        view: int,
+        rgb: Float[Tensor, "3 height width"],
+        picture: Float[Tensor, "3 height width"],
+        weights: Float[Tensor, "height width"] | None,
+    ) -> Float[Tensor, ""]:
+        return photometric_loss(self._exposures.applied(rgb, view), picture, self._ssim_weight, weights)
+
+    def _colours(self) -> Float[Tensor, "gaussian 3"]:
+        return rgb_from_sh(self.splats.params["sh0"][:, 0])
+
+    def _distance_from_model(self) -> Float[Tensor, ""]:
+        """Price of colours that are not the model's any more.
+
+        The model took its colours from photos of different exposures, and the scene has their mean: each is compared as its own photo would
+        show it.
+        """
+        as_taken = self._exposures.applied_to_each(self._colours(), self.splats.params["source_view"])
+        return self._colour_prior * (as_taken - self._first_colours).square().mean()

@@ -27,7 +27,7 @@ from typing import Any
 
 from sceneexpander.artifacts.store import read_json, read_typed, sha256_of_file, to_plain, write_json_atomic
 from sceneexpander.commandline import CommandParser
-from sceneexpander.config.files import read_yaml
+from sceneexpander.config.files import read_settings
 from sceneexpander.errors import EXIT_BAD_INPUT, UserError, entry_point, printable
 from sceneexpander.pipeline.declared import (
     DeclaredStage,
@@ -257,7 +257,7 @@ class PlainRunner:
             return None
         if (file, mark) not in self._parameter_files:
             # As JSON has it, so that what is saved compares equal with what is read again.
-            self._parameter_files[file, mark] = json.loads(json.dumps(read_yaml(path)))
+            self._parameter_files[file, mark] = json.loads(json.dumps(read_settings(path)))
         node = self._parameter_files[file, mark]
         for part in key.split("."):
             node = node.get(part) if isinstance(node, Mapping) else None

@@ -11,6 +11,7 @@ import getpass
 import io
 import os
 import re
+import stat
 import sys
 from pathlib import Path
 
@@ -48,6 +49,7 @@ def pipeline_environment(folder: Path, project: Path, *, error_file: Path | None
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)]),
         "SHELL": "/bin/sh",  # DVC runs commands with it, and a login shell may be /usr/sbin/nologin
         "DVC_NO_ANALYTICS": "true",
+        "DVC_SITE_CACHE_DIR": str(make_site_folder(project)),
         "MLFLOW_DISABLE_TELEMETRY": "true",
     }
     if os.environ.get("PYTHONDONTWRITEBYTECODE"):
@@ -57,6 +59,21 @@ def pipeline_environment(folder: Path, project: Path, *, error_file: Path | None
     if error_file is not None:
         environment[ERROR_FILE_ENV] = str(error_file)
     return _with_a_user(environment, project)
+
+
+def make_site_folder(project: Path) -> Path:
+    """The folder of DVC's databases in a project, where nobody writes who may not write in the project.
+
+    They hold pickles, so who writes them runs code as the user (CVE-2025-69872). DVC's own choice is a folder below ``/var/tmp`` in which
+    every user of the machine may replace those of others, and it makes such a folder wherever there is none.
+    """
+    site = project / ".dvc" / "tmp" / "site"
+    (site / "repo").mkdir(parents=True, exist_ok=True)
+    for folder in (site.parent, site, site / "repo"):
+        status = folder.stat()
+        if status.st_mode & stat.S_IWOTH and status.st_uid == os.getuid():
+            folder.chmod(stat.S_IMODE(status.st_mode) & ~stat.S_IWOTH)
+    return site
 
 
 def _with_a_user(environment: dict[str, str], project: Path) -> dict[str, str]:

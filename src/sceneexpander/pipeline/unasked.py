@@ -14,11 +14,11 @@ from pathlib import Path
 
 from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.artifacts.unavailable import Unavailable
-from sceneexpander.config.files import read_yaml
+from sceneexpander.config.files import read_settings
 from sceneexpander.errors import UserError
 from sceneexpander.files import directory_being_written
 
-METHODS_FILE = "methods.yaml"  # of a scene: for every method that is not always made, whether it is wanted
+METHODS_FILE = "methods.json"  # of a scene: for every method that is not always made, whether it is wanted
 NOT_ASKED = "was not asked for"
 
 
@@ -40,7 +40,7 @@ def answer_unasked(parameters: Mapping[Path, Sequence[str]], outputs: Sequence[P
         return False
     path, (method,) = named[0]
     try:
-        if read_yaml(path)[method] is not False:
+        if read_settings(path)[method] is not False:
             return False
     except (UserError, KeyError, TypeError):
         return False  # the stage itself says what is wrong

@@ -111,8 +111,7 @@ def _replace_folder(source: Path, target: Path, *, move: bool = False) -> None:
 
 def workspace_environment(folder: Path, project: Path) -> dict[str, str]:
     """Environment in which a workspace's stages run its own copy of the sources with this interpreter."""
-    environment = pipeline_environment(folder, project, error_file=folder / ERROR_FILE)
-    return environment | {"DVC_SITE_CACHE_DIR": str(project / ".dvc" / "tmp" / "site")}
+    return pipeline_environment(folder, project, error_file=folder / ERROR_FILE)
 
 
 def reproduce(folder: Path, *, project: Path, lock: RunLock | None = None) -> None:

@@ -15,7 +15,7 @@ from sceneexpander.artifacts.state import ExpansionState, WeightsChange
 from sceneexpander.artifacts.views import ViewSet
 from sceneexpander.frontend.known_check import find_contradictions
 from sceneexpander.frontend.memory import MatchMemory
-from sceneexpander.frontend.prior import FrontendConfig, build_priors
+from sceneexpander.frontend.prior import FrontendConfig, SettledCameras, build_priors
 from sceneexpander.frontend.sfm import SparseReconstruction
 from sceneexpander.geometry.gauge import in_gauge_of
 from sceneexpander.geometry.priors import Priors
@@ -37,12 +37,13 @@ def views_priors(
     seed: int,
     known: KnownCameras | None = None,
     memory: MatchMemory | None = None,
+    settled: SettledCameras | None = None,
 ) -> tuple[Priors, SparseReconstruction | None]:
     """What the model is told about the views: the front-end's estimate; for a model that asks for none, what is ``known``.
 
     ``known`` cameras belong to the first views, see `known_of`; what the views' files say of their lenses is always told. Whatever is known
     is compared with the pictures first, and left out where they contradict it.
-    ``memory`` spares it pictures and pairs that it has seen before, and learns those that it has not.
+    ``memory`` spares it pictures and pairs that it has seen before, and learns those that it has not; ``settled`` cameras are kept.
     """
     known = known_of(views, known)
     if not loaded.uses_front_end:
@@ -63,6 +64,21 @@ def views_priors(
         optics=optics_of(views),
         valid=views.valid,
         memory=memory,
+        settled=settled,
+    )
+
+
+def _settled_cameras(state: ExpansionState) -> SettledCameras | None:
+    """Those of the views that earlier rounds inserted; None in the first round."""
+    priors = state.priors
+    if priors.world_from_cam is None or priors.intrinsics_px is None or not bool(state.views.generated.any()):
+        return None
+    posed = torch.ones_like(state.views.generated) if priors.posed is None else priors.posed
+    return SettledCameras(
+        world_from_cam=priors.world_from_cam,
+        intrinsics_px=priors.intrinsics_px,
+        posed=posed,
+        kept=state.views.generated,
     )
 
 
@@ -150,7 +166,9 @@ def joint_reconstruction(
     ``memory`` is that of round 0.
     """
     views = state.views.append(inserted.view)
-    priors, sparse = views_priors(views, loaded, frontend, seed=seed, known=state.known, memory=memory)
+    priors, sparse = views_priors(
+        views, loaded, frontend, seed=seed, known=state.known, memory=memory, settled=_settled_cameras(state)
+    )
     priors = in_gauge_of(state.priors, priors)
     if sparse is not None:
         announce_cameras(

@@ -21,8 +21,8 @@ from stages.fingerprint import stage_names
 
 ROOT = Path(__file__).parents[3]
 PIPELINE: dict[str, Any] = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
-CONFIG = "outputs/${item.scene}/config.yaml"
-ROUND_SETTINGS = "outputs/${item.scene}/rounds.yaml"
+CONFIG = "outputs/${item.scene}/config.json"
+ROUND_SETTINGS = "outputs/${item.scene}/rounds.json"
 # resolve makes the configuration; the gathering stages get it through the artefacts of the scenes.
 WITHOUT_SECTIONS = {"code", "resolve", "collect", "report", "track"}
 SECTIONS_OF = {"correct": "adapt"}  # which it imports only if it is asked for
@@ -213,7 +213,7 @@ def test_every_method_of_the_catalogue_is_made_by_its_stage(method: Method) -> N
 
 def test_methods_that_can_be_left_out_are_parameters_of_their_stages() -> None:
     for method in METHODS:
-        named = tracked(method.stage, "outputs/${item.scene}/methods.yaml")
+        named = tracked(method.stage, "outputs/${item.scene}/methods.json")
         assert bool(named) is not method.always_made, method.name
 
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import pytest
 
-from sceneexpander.config.files import read_yaml
+from sceneexpander.config.files import read_settings, read_yaml, write_settings
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.errors import UserError
 
@@ -145,3 +145,25 @@ def test_a_path_that_is_no_file_is_one_line(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / ("x" * 300), tmp_path / "nothing"):
         with pytest.raises(ConfigError):
             read_yaml(path)
+
+
+def test_settings_come_back_as_they_were_written(tmp_path: Path) -> None:
+    settings = {"rate": 1e-05, "name": "Größe: #1", "none": None, "yes": True, "list": [1, {"a": "2"}], "a": {}}
+    write_settings(tmp_path / "config.json", settings)
+    assert read_settings(tmp_path / "config.json") == settings
+    assert list(read_settings(tmp_path / "config.json")) == sorted(settings)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [("{", "is not valid JSON"), ('{"a": 1, "a": 2}', "has a key twice"), ("[" * 100_000, "is nested too deeply")],
+    ids=["cut", "twice", "deep"],
+)
+def test_damaged_settings_are_one_line(tmp_path: Path, text: str, problem: str) -> None:
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        read_settings(tmp_path / "config.json")
+    assert problem in caught.value.line()
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(ConfigError):
+            read_settings(path)

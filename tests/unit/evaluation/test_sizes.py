@@ -11,7 +11,8 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import to_bytes
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import evaluate
-from sceneexpander.evaluation.sizes import at_sizes
+from sceneexpander.evaluation.sizes import AtOtherSizes, at_sizes
+from sceneexpander.evaluation.views import see_views
 from sceneexpander.geometry.camera import resize_intrinsics
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.splatting import render
@@ -83,6 +84,23 @@ def test_pixels_that_show_nothing_of_the_place_are_not_open() -> None:
     shown[4:-4, WIDTH // 2 + 4 : -4] = True
     assert at_sizes(half_wall, 0, photo_of(wall, 1), shown, CONFIG)["own"].open_share == 0
     assert at_sizes(half_wall, 0, photo_of(wall, 1), None, CONFIG)["own"].open_share > 0.4
+
+
+def test_a_photo_of_the_stored_size_has_the_same_numbers_measured_once_or_again() -> None:
+    made = made_reconstruction()
+    views = own_pictures(made)
+    views = dataclasses.replace(views, images=(views.images * 0.9 + 0.02), detail_images=(views.images * 0.9 + 0.02))
+    for view in see_views(made, views, CONFIG):
+        again = at_sizes(made, view.index, view.photo, view.valid, CONFIG, ("own",))["own"]
+        as_stored = dataclasses.replace(view, picture=view.photo)
+        named = "at_picture_size" if view.generated else "at_photo_size"
+        once = AtOtherSizes().of_view(as_stored)
+        assert once[f"psnr_{named}_db"] == again.psnr_db
+        assert once[f"ssim_{named}"] == again.ssim
+        assert once[f"seen_through_{named}"] == again.open_share
+        # Another picture than the photo says nothing about the photo.
+        other = dataclasses.replace(view, picture=view.photo * 0.5)
+        assert AtOtherSizes().of_view(other)[f"psnr_{named}_db"] == again.psnr_db
 
 
 def test_rows_hold_the_means_over_captured_views() -> None:

@@ -17,7 +17,7 @@ from sceneexpander.errors import UserError
 from sceneexpander.evaluation.config import EvaluateConfig
 from sceneexpander.evaluation.evaluate import MEASURES, evaluate
 from sceneexpander.evaluation.image import psnr
-from sceneexpander.evaluation.sizes import PSNR_CAP_DB
+from sceneexpander.evaluation.likeness import PSNR_CAP_DB
 from sceneexpander.evaluation.views import measure_views, navigation_coverage, same_place, see_views
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.geometry.similarity import Similarity

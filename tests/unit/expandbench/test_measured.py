@@ -14,7 +14,7 @@ from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.state import save_priors
 from sceneexpander.artifacts.store import write_json_atomic
 from sceneexpander.config.compose import compose
-from sceneexpander.config.files import write_yaml
+from sceneexpander.config.files import write_settings
 from sceneexpander.config.parse import ConfigError, parse_dataclass
 from sceneexpander.config.schema import ProjectConfig
 from sceneexpander.expandbench import run as bench
@@ -47,6 +47,15 @@ def config(row: str) -> ProjectConfig:
 def method(row: str) -> MethodConfig:
     chosen = config(row)
     return MethodConfig(adapt=chosen.adapt, corrections=chosen.corrections)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Sums round as threads divide them, and a stage that runs in this process sets their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -152,12 +161,12 @@ def test_a_correction_of_another_package_runs_in_stages_and_benchmark(
     inputs.inserted.save(layout.inserted("s", 1))
     inputs.anchors.save(layout.anchors("s", 1))
     save_priors(layout.joint_priors("s", 1), inputs.joint_priors)
-    write_yaml(layout.config("s"), values)
+    write_settings(layout.config("s"), values)
     write_json_atomic(layout.ENVIRONMENT, {"kernel": kernel_build()})
     for lock in LOCKS:
         (tmp_path / lock).symlink_to(ROOT / lock)
     write_json_atomic(layout.CODE, {"adapt": "0" * 64, "correct": "0" * 64})
-    write_yaml(layout.selection("s"), {"corrected": True})
+    write_settings(layout.selection("s"), {"corrected": True})
     for stage, method in ((adapt, "sceneexpander"), (correct, "corrected")):
         more = [method] if stage is correct else []
         monkeypatch.setattr("sys.argv", [stage.__name__, "s", "1", "0", *more])

@@ -24,7 +24,7 @@ from sceneexpander.expansion import (
     joint_reconstruction,
     load_model,
 )
-from sceneexpander.frontend.prior import FrontendConfig
+from sceneexpander.frontend.prior import FrontendConfig, SettledCameras
 from sceneexpander.geometry.priors import Priors
 from sceneexpander.models.omnivggt import OmniVGGT, OmniVGGTConfig
 from sceneexpander.models.worldmirror import WorldMirror, WorldMirrorConfig
@@ -103,6 +103,31 @@ def test_the_second_round_starts_from_the_first(tmp_path: Path) -> None:
     after, expanded = again.state, again.scene
     assert len(after.views) == 5
     assert expanded.generated.tolist() == [False, False, False, True, True]
+
+
+def test_what_earlier_rounds_inserted_keeps_its_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[SettledCameras | None] = []
+
+    def note(views: ViewSet, *_: object, settled: SettledCameras | None, **__: object) -> tuple[Priors, None]:
+        told.append(settled)
+        return Priors(), None
+
+    monkeypatch.setattr("sceneexpander.reconstruction.views.views_priors", note)
+    loaded = _tiny()
+    inputs, _, _ = _round(loaded)
+    state = make_procedure(CONFIG).run(inputs, loaded, seed=0).state
+    known = Priors(
+        world_from_cam=torch.eye(4).repeat(4, 1, 1),
+        intrinsics_px=torch.eye(3).repeat(4, 1, 1),
+        posed=torch.tensor([True, True, False, True]),
+    )
+    joint_reconstruction(replace(state, priors=known), _inserted(2), loaded, FrontendConfig(), seed=0)
+    *first_round, settled = told
+    assert first_round == [None]  # photos are found again, with the new picture among them
+    assert settled is not None
+    assert settled.kept.tolist() == [False, False, False, True]
+    assert settled.posed.tolist() == [True, True, False, True]
+    assert settled.world_from_cam is known.world_from_cam
 
 
 def test_worldmirror_runs_a_round_with_strictly_loaded_weights(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from sceneexpander.artifacts.renders import Renders
 from sceneexpander.artifacts.unavailable import Unavailable
 from sceneexpander.cli.judge_run import judge_run, parse_arguments
 from sceneexpander.config.compose import compose
-from sceneexpander.config.files import write_yaml
+from sceneexpander.config.files import write_settings
 from sceneexpander.errors import UserError
 from sceneexpander.pipeline.preflight import check_scene
 from sceneexpander.pipeline.project import JUDGED_FOLDER, ROOT_ENV
@@ -69,7 +69,7 @@ def run(tmp_path: Path) -> Path:
             intrinsics_px=torch.eye(3).repeat(5, 1, 1),
         ).save(place)  # fmt: skip
     Unavailable(method="omnivggt", model="x", reason="needs the public checkpoint").save(made / "renders" / "omnivggt")
-    write_yaml(
+    write_settings(
         folder / "params.yaml",
         {"scenes": ["yard"], "rounds": [{"k": 1, "prev": 0}], "methods": list(METHODS), "overrides": []},
     )
@@ -113,11 +113,11 @@ def test_the_stage_asks_nobody_unless_told_and_nobody_twice(
     monkeypatch.chdir(run)
     place = Path("outputs/yard")
     stage = judge_stage.main.__wrapped__  # type: ignore[attr-defined]
-    write_yaml(place / "config.yaml", compose(CONF, []))
+    write_settings(place / "config.json", compose(CONF, []))
     stage(Cell(scene="yard", round=1))
     assert JudgedRound.load(place / "round_1/judged").text("backbone", "quality") == "no judge"
     assert service.asked == []
-    write_yaml(place / "config.yaml", compose(CONF, overrides(service)))
+    write_settings(place / "config.json", compose(CONF, overrides(service)))
     stage(Cell(scene="yard", round=1))
     stage(Cell(scene="yard", round=1))
     assert len(service.asked) == 6, "forced, it comes from the cache"

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.nn import functional
 
+from sceneexpander.artifacts.reconstruction import Reconstruction
 from sceneexpander.artifacts.views import to_bytes
 from sceneexpander.errors import UserError
 from sceneexpander.evaluation.image import psnr
@@ -20,8 +21,9 @@ from sceneexpander.photometric.config import RefineConfig
 from sceneexpander.photometric.refine import refine
 from sceneexpander.splatting import render
 from tests.worlds.spoiled import TRUTH, VIEWS, spoiled
+from tests.worlds.wall import made_reconstruction, own_pictures
 
-CONFIG = RefineConfig(visits=20, colours=0.1)  # fast colours: the start is grey
+CONFIG = RefineConfig(visits=20, colours=0.1, colour_prior=0.0)  # fast colours and free: the start is grey
 IMAGES = VIEWS.images
 
 
@@ -151,3 +153,46 @@ def test_what_only_the_photos_show_is_fitted() -> None:
     without, _ = refine(spoiled(), stored, CONFIG, seed=0)
     given, _ = refine(spoiled(), stored, CONFIG, photos=photos, seed=0)
     assert own(given.gaussians) > own(without.gaussians) + 0.3
+
+
+def test_what_photos_do_not_agree_in_is_not_learnt_by_heart() -> None:
+    whole = made_reconstruction((0.0, 0.3, 0.15), generated_last=False)
+    posed = whole.posed.clone()
+    posed[2] = False
+    gaussians = whole.gaussians
+    start = replace(whole, gaussians=gaussians.select(gaussians.source_view != 2), posed=posed)
+    truth = own_pictures(whole).images
+    # What a photo has for itself: here noise, in real ones mostly detail whose depth is wrong.
+    photos = truth + 0.15 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
+
+    def held_out(result: Reconstruction) -> float:
+        seen = render(result.gaussians, Cameras(whole.world_from_cam[2:], whole.intrinsics_px[2:], *truth.shape[2:]))
+        return psnr(seen.rgb[0], truth[2])
+
+    kept, _ = refine(start, photos, RefineConfig(visits=16), seed=0)
+    free, _ = refine(start, photos, RefineConfig(visits=16, colour_prior=0.0), seed=0)
+    assert held_out(kept) > held_out(free) + 2
+
+
+def test_a_photo_is_shown_by_the_gaussians_of_the_others() -> None:
+    whole = made_reconstruction((0.0, 0.1), generated_last=False)
+    images, gaussians = own_pictures(whole).images, whole.gaussians
+    # The second photo's are grey and lie behind those of the first, which show both photos almost: all at once, only these learn.
+    behind = (gaussians.source_view == 1)[:, None]
+    start = replace(
+        whole,
+        gaussians=replace(
+            gaussians,
+            means=gaussians.means + 0.2 * behind * torch.tensor([0.0, 0.0, 1.0]),
+            sh=0.8 * gaussians.sh * ~behind[:, None],
+            opacities=torch.full_like(gaussians.opacities, 0.99),
+        ),
+    )
+
+    def shown_by_second(result: Reconstruction) -> float:
+        others = result.gaussians.select(result.gaussians.source_view == 1)
+        seen = render(others, Cameras(whole.world_from_cam[:1], whole.intrinsics_px[:1], *images.shape[2:]))
+        return psnr(seen.rgb[0] / seen.alpha[0].clamp(min=0.5), images[0], seen.alpha[0] > 0.5)
+
+    result, _ = refine(start, images, CONFIG, seed=0)
+    assert shown_by_second(result) > shown_by_second(start) + 6

@@ -143,7 +143,7 @@ stages:
   made:
     matrix: {method: [wanted, unwanted]}
     cmd: echo ${item.method} >> log && mkdir -p out/${item.method} out/stats && echo '{}' > out/stats/${item.method}.json
-    params: [out/methods.yaml: ["${item.method}"]]
+    params: [out/methods.json: ["${item.method}"]]
     outs: ["out/${item.method}", "out/stats/${item.method}.json"]
 """
 
@@ -151,12 +151,12 @@ stages:
 def test_no_process_starts_for_a_method_that_was_not_asked_for(folder: Path) -> None:
     (folder / "dvc.yaml").write_text(UNASKED)
     (folder / "out").mkdir()
-    (folder / "out" / "methods.yaml").write_text("wanted: true\nunwanted: false\n")
+    (folder / "out" / "methods.json").write_text('{"wanted": true, "unwanted": false}')
     assert dvc_adapter.reproduce(["--quiet"]) == 0
     assert (folder / "log").read_text() == "wanted\n"
     assert unavailable_in(folder / "out" / "unwanted" / "reconstruction") == Unavailable(
         method="unwanted", model="", reason="was not asked for"
     )
-    (folder / "out" / "methods.yaml").write_text("wanted: true\nunwanted: true\n")
+    (folder / "out" / "methods.json").write_text('{"wanted": true, "unwanted": true}')
     assert dvc_adapter.reproduce(["--quiet"]) == 0
     assert (folder / "log").read_text() == "wanted\nunwanted\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -93,6 +94,26 @@ def test_dvc_runs_a_pipeline_there(name: str, tmp_path: Path) -> None:
         )
         assert done.returncode == 0, done.stderr
     assert (folder / "o" / "x").read_text() == "x\n"
+
+
+@pytest.mark.parametrize("before", [None, 0o777])
+def test_nobody_else_can_replace_the_databases_of_dvc(before: int | None, tmp_path: Path) -> None:
+    (tmp_path / ".dvc").mkdir()
+    (tmp_path / ".dvc" / "config").write_text((ROOT / ".dvc" / "config").read_text())
+    (tmp_path / "dvc.yaml").write_text("stages:\n  a:\n    cmd: mkdir o && echo x > o/x\n    outs: [o]\n")
+    if before is not None:  # as DVC makes them itself
+        for folder in ("tmp", "tmp/site", "tmp/site/repo"):
+            (tmp_path / ".dvc" / folder).mkdir()
+            (tmp_path / ".dvc" / folder).chmod(before)
+    settle_project(tmp_path)
+    environment = pipeline_environment(tmp_path, tmp_path) | {"PYTHONPATH": str(ROOT / "src")}
+    command = [sys.executable, "-m", "sceneexpander.pipeline"]
+    subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=True)
+    databases = list((tmp_path / ".dvc" / "tmp" / "site").rglob("*.db"))
+    assert databases
+    for database in databases:
+        for place in (database, *database.relative_to(tmp_path).parents):
+            assert not (tmp_path / place).stat().st_mode & stat.S_IWOTH, place
 
 
 def test_a_folder_without_version_control_is_settled_once(tmp_path: Path) -> None:

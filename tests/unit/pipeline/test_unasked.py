@@ -13,7 +13,7 @@ import pytest
 
 from sceneexpander.artifacts.page import StageRun
 from sceneexpander.artifacts.store import read_json, read_typed
-from sceneexpander.config.files import write_yaml
+from sceneexpander.config.files import write_settings
 from sceneexpander.pipeline.declared import read_pipeline
 from sceneexpander.pipeline.unasked import METHODS_FILE, answer_unasked
 
@@ -30,7 +30,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         for file, keys in stage.parameters.items():
             if Path(file).name == METHODS_FILE:
                 asked = {key: False for other in UNASKED for key in other.parameters[file]}
-                write_yaml(tmp_path / file, asked | dict.fromkeys(keys, False))
+                write_settings(tmp_path / file, asked | dict.fromkeys(keys, False))
     return tmp_path
 
 
@@ -62,8 +62,8 @@ print(sorted({"torch", "numpy", "cv2", "mlflow", "hydra", "rich"} & set(sys.modu
 def test_a_stage_that_only_says_so_starts_in_no_time(folder: Path) -> None:
     """With plain ``dvc repro`` each is a process: what takes seconds there is the import of torch."""
     (judge,) = [stage for stage in read_pipeline(ROOT) if stage.name == "judge"]
-    (settings,) = [file for file in judge.parameters if file.endswith("config.yaml")]
-    write_yaml(folder / settings, {"judge": {"backend": "none"}})
+    (settings,) = [file for file in judge.parameters if file.endswith("config.json")]
+    write_settings(folder / settings, {"judge": {"backend": "none"}})
     commands = [stage.command.replace("'", "").removeprefix("python -m ") for stage in (*UNASKED, judge)]
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'src'}"}
     script = [sys.executable, "-c", _SAY_SO, *commands]
@@ -76,12 +76,12 @@ def test_the_stages_are_those_of_methods_that_can_be_left_out() -> None:
     assert {stage.name for stage in UNASKED} == {"correct", "rival", "gaussian_splatting", "optimise"}
 
 
-@pytest.mark.parametrize("asked", ["m: true\n", "other: false\n", "- m\n", "m: 0\n", "{"])
+@pytest.mark.parametrize("asked", ['{"m": true}', '{"other": false}', '["m"]', '{"m": 0}', "{"])
 def test_everything_else_is_the_stages_own(asked: str, tmp_path: Path) -> None:
     (tmp_path / METHODS_FILE).write_text(asked)
     outputs = [tmp_path / "m", tmp_path / "m.json"]
     assert not answer_unasked({tmp_path / METHODS_FILE: ["m"]}, outputs)
-    assert not answer_unasked({tmp_path / "config.yaml": ["m"]}, outputs)
-    (tmp_path / METHODS_FILE).write_text("m: false\n")
+    assert not answer_unasked({tmp_path / "config.json": ["m"]}, outputs)
+    (tmp_path / METHODS_FILE).write_text('{"m": false}')
     assert not answer_unasked({tmp_path / METHODS_FILE: ["m"]}, [tmp_path / "other"])
     assert not (tmp_path / "m").exists()
