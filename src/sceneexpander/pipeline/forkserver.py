@@ -35,6 +35,7 @@ from sceneexpander.pipeline.processes import end_with_parent
 _SHARED = (
     "stages",
     "torch",
+    "torch._dynamo",  # what the first optimiser of a process loads: a second and a half
     "cv2",
     "omegaconf",
     "safetensors.torch",
