@@ -49,7 +49,7 @@ class RefineConfig:
     ssim_weight: Share = 0.2  # of 1 - SSIM beside the mean absolute error
     solid_weight: Weight = 0.2  # of the light that passes through what a picture shows
     colour_prior: Weight = (
-        50.0  # of the mean squared distance of colours from the model's, each as its own photo was exposed
+        20.0  # of the mean squared distance of colours from the model's, each as its own photo was exposed
     )
 
     def __post_init__(self) -> None:
