@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,17 +31,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 
 def read_yaml(path: Path) -> Any:
     """Plain values of a YAML file. Raises `ConfigError` naming the file if it is missing or malformed, or says something twice."""
-    try:
-        return yaml.load(path.read_text(encoding="utf-8"), _UniqueKeyLoader)  # noqa: S506 - a safe loader
-    except FileNotFoundError:
-        raise ConfigError("does not exist", where=path) from None
-    except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror})", where=path) from None
-    except RecursionError:
-        raise ConfigError("is nested too deeply", where=path) from None
-    # Beside its own errors, the loader lets those of dates and of very long numbers through.
-    except (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError) as error:
-        raise ConfigError(f"is not valid YAML ({shorten(str(error), 200)})", where=path) from None
+    return _read(path, "YAML", lambda text: yaml.load(text, _UniqueKeyLoader))  # noqa: S506 - a safe loader
 
 
 def read_settings(path: Path) -> Any:
@@ -51,16 +41,21 @@ def read_settings(path: Path) -> Any:
     """
     if path.suffix != ".json":
         return read_yaml(path)
+    return _read(path, "JSON", lambda text: json.loads(text, object_pairs_hook=_unique))
+
+
+def _read(path: Path, language: str, parse: Callable[[str], Any]) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_unique)
+        return parse(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ConfigError("does not exist", where=path) from None
     except OSError as error:
         raise ConfigError(f"cannot be read ({error.strerror})", where=path) from None
     except RecursionError:
         raise ConfigError("is nested too deeply", where=path) from None
-    except ValueError as error:
-        raise ConfigError(f"is not valid JSON ({shorten(str(error), 200)})", where=path) from None
+    # Beside its own errors, YAML's loader lets those of dates and of very long numbers through.
+    except (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError) as error:
+        raise ConfigError(f"is not valid {language} ({shorten(str(error), 200)})", where=path) from None
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -71,7 +66,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def write_settings(path: Path, content: Mapping[str, Any]) -> None:
-    """Write sorted JSON atomically. DVC reads such a file for every stage that depends on it, and YAML fifty times slower."""
+    """Write sorted JSON atomically. DVC reads such a file for every stage that depends on it, and YAML hundreds of times slower."""
     text = json.dumps(dict(content), sort_keys=True, ensure_ascii=False, indent=1)
     write_bytes_atomic(path, f"{text}\n".encode())
 
