@@ -1,5 +1,7 @@
 """Small models to adapt, with their inputs."""
 
+import string
+
 import torch
 
 from sceneexpander.adaptation.config import AdaptConfig
@@ -26,12 +28,13 @@ def adapted_mini() -> tuple[Reconstructor, AdaptationInputs]:
 
 
 def inputs_for(model: Reconstructor, images: torch.Tensor, priors: Priors | None) -> AdaptationInputs:
-    captured = None if priors is None else priors.select(range(4))
+    count = len(images) - 1  # the last one is inserted
+    captured = None if priors is None else priors.select(range(count))
     with torch.no_grad():
-        frozen = model.predict(images[:4], captured, heads=GEOMETRY_HEADS)
+        frozen = model.predict(images[:count], captured, heads=GEOMETRY_HEADS)
     anchors = Anchors(
         weights_sha256="0",
-        view_ids=("a", "b", "c", "d"),
+        view_ids=tuple(string.ascii_lowercase[:count]),
         camera_vector=frozen.camera_vector,
         depth=frozen.depth,
         depth_conf=frozen.depth_conf,
@@ -39,7 +42,7 @@ def inputs_for(model: Reconstructor, images: torch.Tensor, priors: Priors | None
         normals_conf=frozen.normals_conf,
     )
     return AdaptationInputs(
-        captured=images[:4], inserted=images[4], anchors=anchors, captured_priors=captured, joint_priors=priors
+        captured=images[:count], inserted=images[count], anchors=anchors, captured_priors=captured, joint_priors=priors
     )
 
 

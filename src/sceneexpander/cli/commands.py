@@ -23,6 +23,7 @@ class Command:
 COMMANDS = (
     Command("expand", "sceneexpander.cli.expand", "expand the scene of a folder of photos by a picture and a sentence"),
     Command("run", "sceneexpander.pipeline.plain", "bring the project's pipeline up to date without DVC"),
+    Command("status", "sceneexpander.cli.status", "say which stages of the pipeline would run, and why"),
     Command("sweep", "sceneexpander.cli.sweep", "run the pipeline for many combinations of settings"),
     Command("ablation", "sceneexpander.cli.ablation", "measure what each part of the method does, against known truth"),
     Command(

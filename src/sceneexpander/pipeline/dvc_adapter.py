@@ -10,7 +10,6 @@ import atexit
 import contextlib
 import functools
 import os
-import re
 import shutil
 import signal
 import sys
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneexpander.files import write_bytes_atomic
+from sceneexpander.pipeline.dvc_memory import LOCK_HEAD, MEMORY_FILE, Memory, remembering, split_lock
 from sceneexpander.pipeline.forkserver import ForkServer, read_order
 from sceneexpander.pipeline.unasked import answer_unasked
 
@@ -32,7 +32,17 @@ def reproduce(arguments: Sequence[str]) -> int:
     _take_any_path()
     _write_locks_by_stage()
     _start_stages()
-    return int(main(["repro", *arguments]))
+    with _remembering():
+        return int(main(["repro", *arguments]))
+
+
+def report_status(arguments: Sequence[str]) -> int:
+    """``dvc status ARGUMENTS`` in the current folder. Returns its exit code."""
+    from dvc.cli import main
+
+    _take_any_path()
+    with _remembering(), _without_stage_locks():
+        return int(main(["status", *arguments]))
 
 
 @dataclass(slots=True)
@@ -92,7 +102,28 @@ def reproduce_stage(address: str) -> None:
 
     _write_locks_by_stage()
     _start_stages()
-    Repo().reproduce(targets=[address], single_item=True)
+    with _remembering():
+        Repo().reproduce(targets=[address], single_item=True)
+
+
+@contextlib.contextmanager
+def _without_stage_locks() -> Iterator[None]:
+    """Let DVC only look: it would write a file of locks twice for every stage, and refuse to look while a stage runs."""
+    from dvc import rwlock
+
+    original, module = rwlock.rwlock, vars(rwlock)
+    module["rwlock"] = lambda *_, **__: contextlib.nullcontext()
+    try:
+        yield
+    finally:
+        module["rwlock"] = original
+
+
+@contextlib.contextmanager
+def _remembering() -> Iterator[None]:
+    ignored = Path(".dvcignore")
+    with remembering(Memory(MEMORY_FILE), ignored.read_text(encoding="utf-8") if ignored.is_file() else ""):
+        yield
 
 
 def can_use_repository(folder: Path) -> bool:
@@ -183,9 +214,6 @@ def _uninterrupted() -> Iterator[None]:
         signal.signal(signal.SIGINT, previous)
 
 
-_STAGE_LINE = re.compile(r"^  (?=[^ ])", re.MULTILINE)
-
-
 def _write_locks_by_stage() -> None:
     """Let DVC replace one stage's lines of ``dvc.lock`` instead of reading and writing all of it after every stage.
 
@@ -202,33 +230,17 @@ def _write_locks_by_stage() -> None:
         from dvc.stage import serialize
 
         path = Path(self.path)
-        parts = _split_lock(path)
+        parts = split_lock(path)
         new = {name: text for stage in stages for name, text in _lock_texts(serialize.to_lockfile(stage, **kwargs))}
         if parts is None or any(name.startswith("?") for name in new):
             original(self, stages, **kwargs)
             return
         if all(parts.get(name) == text for name, text in new.items()):
             return
-        write_bytes_atomic(path, (_LOCK_HEAD + "".join((parts | new).values())).encode())
+        write_bytes_atomic(path, (LOCK_HEAD + "".join((parts | new).values())).encode())
         self.repo.scm_context.track_file(self.relpath)
 
     Lockfile.dump_stages, Lockfile._writes_by_stage = dump_stages, True
-
-
-_LOCK_HEAD = "schema: '2.0'\nstages:\n"
-
-
-def _split_lock(path: Path) -> dict[str, str] | None:
-    """The lines of every stage in a lock file, by name. None: there is no file yet, or it is of another form."""
-    text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    if not text.startswith(_LOCK_HEAD) or not text.endswith("\n"):
-        return None
-    if "\n  ? " in text:  # names of more than 128 letters are written in another way
-        return None
-    head, *parts = _STAGE_LINE.split(text.removeprefix(_LOCK_HEAD))
-    if head or any(line[:1] != " " for line in text.removeprefix(_LOCK_HEAD).splitlines()):
-        return None
-    return {part.partition(":\n")[0]: f"  {part}" for part in parts}
 
 
 def _lock_texts(content: dict[str, Any]) -> Iterator[tuple[str, str]]:

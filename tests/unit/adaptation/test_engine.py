@@ -7,6 +7,7 @@ import torch
 
 from sceneexpander.adaptation.config import EngineConfig, Precision
 from sceneexpander.adaptation.engine import set_up
+from sceneexpander.adaptation.learner import Learner
 from sceneexpander.adaptation.loop import adapt
 from sceneexpander.artifacts.store import sha256_of_tensors
 from sceneexpander.errors import UserError
@@ -95,3 +96,16 @@ def test_a_model_without_the_option_says_so() -> None:
     with pytest.raises(UserError, match="tiny can neither recompute"):
         set_up(TinyReconstructor(), replace(STEPS, engine=EngineConfig(checkpoint_activations=True)))
     set_up(TinyReconstructor(), STEPS)
+
+
+def test_the_teacher_saves_memory_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its views in chunks too: without, it would need what the student was spared."""
+    model, inputs = adapted_worldmirror()
+    told = []
+    save = type(model).save_memory
+    monkeypatch.setattr(
+        type(model), "save_memory", lambda self, **how: told.append((id(self), how)) or save(self, **how)
+    )
+    learner = Learner(model, inputs.anchors, replace(STEPS, engine=EngineConfig(views_per_chunk=1)), seed=0)
+    assert {whose for whose, _ in told} == {id(model), id(learner.teacher)}
+    assert all(how["views_per_chunk"] == 1 for _, how in told)

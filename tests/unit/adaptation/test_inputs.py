@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sceneexpander.adaptation.config import AdaptConfig, AugmentConfig, Gauge
-from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource
+from sceneexpander.adaptation.inputs import AdaptationInputs, ViewSource, geometry_of
 from sceneexpander.adaptation.loop import adapt
 from sceneexpander.adaptation.sampling import Batch
 from sceneexpander.artifacts.store import sha256_of_tensors
@@ -160,3 +160,42 @@ def test_with_p_0_nothing_of_the_joint_estimate_reaches_the_student(gauge: Gauge
             for given in (inputs, other)
         }
         assert len(bits) == runs
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_what_is_measured_of_all_views_counts_the_inserted_one(count: int) -> None:
+    """With an odd number of photos too: what is known of the inserted view is the joint estimate's last entry."""
+    images, priors = scene(count + 1, 56, 84)
+    inputs = inputs_for(make_model(perturbed=True), images, priors)
+    assert inputs.joint_priors is not None
+    views = ViewSource(make_model(perturbed=True), inputs, STEPS, seed=0).views(
+        Batch(captured=(0, 2), inserted=True), 1
+    )
+    assert isinstance(views.prepared, PreparedViews)
+    assert torch.equal(views.prepared.priors.depth[2], inputs.joint_priors.depth[count])
+
+
+@pytest.mark.parametrize("captured", [(0, 2), (1, 3), (3, 1)])
+def test_priors_stand_in_the_frame_of_the_first_view_that_is_there(captured: tuple[int, ...]) -> None:
+    inputs = inputs_of(4, 1.0)
+    known = inputs.joint_priors
+    assert known is not None
+    assert known.world_from_cam is not None
+    priors = (
+        ViewSource(GaugedReconstructor(), inputs, STEPS, seed=0)
+        .views(Batch(captured=captured, inserted=True), 1)
+        .priors
+    )
+    assert priors is not None
+    assert priors.world_from_cam is not None
+    first = torch.linalg.inv(known.world_from_cam[captured[0]])
+    torch.testing.assert_close(priors.world_from_cam, first @ known.world_from_cam[[*captured, 4]])
+    torch.testing.assert_close(priors.world_from_cam[0], torch.eye(4))
+
+
+@pytest.mark.parametrize("missing", ["depth", "normals"])
+def test_a_model_without_a_head_that_the_losses_read_is_refused(missing: str) -> None:
+    inputs = inputs_of(2, 1.0)
+    prediction = GaugedReconstructor().predict(inputs.captured, inputs.captured_priors)
+    with pytest.raises(ValueError, match="needs the depth and normal heads"):
+        geometry_of(replace(prediction, **{missing: None}))
