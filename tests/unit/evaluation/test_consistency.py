@@ -154,3 +154,30 @@ def test_ghosting_needs_structure_and_equal_finite_pictures() -> None:
         find_ghosting(photo, photo[:, :100], everywhere)
     with pytest.raises(ValueError, match="non-finite"):
         find_ghosting(photo, photo * torch.nan, everywhere)
+
+
+def test_ghosting_is_a_matter_of_the_picture_not_of_its_size() -> None:
+    """Pieces grow with it, so that as many are looked up in a picture of three times the pixels per side."""
+    small = texture(1, 240, 320)
+    double = 0.5 * small + 0.5 * small.roll(5, dims=-1)
+    once = ghosting(small, double)
+    thrice = ghosting(
+        *(torch.nn.functional.interpolate(it[None], scale_factor=3, mode="bicubic")[0] for it in (small, double))
+    )
+    assert thrice.ghosted == pytest.approx(once.ghosted, abs=0.06)
+    assert thrice.offset == pytest.approx(once.offset, abs=0.003)
+
+
+def test_structure_of_equal_brightness_is_none() -> None:
+    """Brightness is what Rec. 601 makes of a colour: red by 0.299, green by 0.587, blue by 0.114."""
+    waves = texture(2, 120, 160)[0] - 0.5
+    waves /= waves.abs().max()
+    everywhere = torch.ones(120, 160, dtype=torch.bool)
+    weights = (0.299, 0.587, 0.114)
+    for up, down in ((0, 1), (1, 0), (2, 1)):
+        amount = 0.45 * min(1.0, weights[down] / weights[up])
+        picture = torch.full((3, 120, 160), 0.5)
+        picture[up] += amount * waves
+        assert find_ghosting(picture, picture, everywhere) is not None
+        picture[down] -= amount * weights[up] / weights[down] * waves
+        assert find_ghosting(picture, picture, everywhere) is None

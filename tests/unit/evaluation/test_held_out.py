@@ -147,6 +147,22 @@ def test_given_cameras_are_taken_where_the_method_kept_them_and_not_elsewhere() 
     torch.testing.assert_close(found.world_from_cam[0], TRUE, atol=0.02, rtol=0)
 
 
+@pytest.mark.parametrize("place", [0.0, 40.0])
+def test_kept_cameras_are_judged_by_how_far_apart_they_are_wherever_they_stand(place: float) -> None:
+    scene, pictures, held_out = made()
+    seen = see_views(scene, pictures, CONFIG)
+    away = Similarity(
+        scale=1.0, rotation=torch.eye(3).double(), translation=torch.tensor([place, -place, 0.0]).double()
+    )
+    scene = dataclasses.replace(scene, world_from_cam=away.poses(scene.world_from_cam.double()).float())
+    world = torch.cat([scene.world_from_cam, away.poses(TRUE[None].double()).float()]).double()
+    for off, kept in ((0.0, True), (0.02, False)):
+        given = world.clone()
+        given[2, :3, 3] += torch.tensor([0.0, off, 0.0])
+        told = dataclasses.replace(held_out, given=("000", "001", "002", "900"), given_world_from_cam=given, ties=())
+        assert (pose_held_out(scene, told, 0, seen) is not None) == kept
+
+
 def test_a_lens_of_its_own_is_found_with_the_pose() -> None:
     scene, pictures, held_out = made()
     camera = pose_held_out(scene, dataclasses.replace(held_out, lens_of=("",)), 0, see_views(scene, pictures, CONFIG))

@@ -122,3 +122,20 @@ def test_what_cannot_be_compared_is_refused(measure) -> None:  # type: ignore[no
     broken[0, 0, 0] = float("nan")
     with pytest.raises(ValueError, match="non-finite"):
         measure(first, broken)
+
+
+def test_pixels_that_do_not_count_are_black_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And those that count are as they are."""
+    given: list[tuple[torch.Tensor, torch.Tensor]] = []
+    for name in ("lpips", "cvvdp"):
+        monkeypatch.setattr(visual, name, lambda image, picture, *_: given.append((image, picture)) or 0.0)
+    image, picture = torch.rand(2, 3, 40, 50, generator=torch.Generator().manual_seed(0)) * 0.9 + 0.1
+    valid = torch.ones(40, 50, dtype=torch.bool)
+    valid[:, :20] = False
+    config = EvaluateConfig(lpips_weights="a file", cvvdp=True, flip=False)
+    assert set(visual._looks(image, picture, valid, config, "captured")) == {"lpips_captured", "cvvdp_captured"}
+    assert len(given) == 2
+    for pair in given:
+        for seen, whole in zip(pair, (image, picture), strict=True):
+            assert torch.equal(seen[:, valid], whole[:, valid])
+            assert not seen[:, ~valid].any()
