@@ -68,13 +68,19 @@ def _escaped(letter: str) -> str:
     return repr(letter)[1:-1]
 
 
+_MOST_NAMED = 100
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """What to do about an unknown word: the nearest known one, or all of them. Meant for `UserError.fix`."""
+    """What to do about an unknown word: the nearest known one, or all of them unless there are very many. Meant for `UserError.fix`."""
     choices = sorted(known)
     # Another case is the nearest of all, although letter by letter it may have nothing in common.
     same = [choice for choice in choices if choice.casefold() == word.casefold()]
     close = same or difflib.get_close_matches(word, choices, n=1, cutoff=0.6)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(choices)}"
+    if close:
+        return f"did you mean {close[0]!r}?"
+    more = f" and {len(choices) - _MOST_NAMED} more" if len(choices) > _MOST_NAMED else ""
+    return f"known: {', '.join(choices[:_MOST_NAMED])}{more}"
 
 
 def disk_full(error: BaseException) -> UserError | None:

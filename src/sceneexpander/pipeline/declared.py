@@ -79,10 +79,12 @@ def select_stages(stages: Sequence[DeclaredStage], targets: Sequence[str]) -> tu
     """The named stages (addresses, or names for all of one kind) with all that they depend on; no names: all stages."""
     if not targets:
         return tuple(stages)
-    known = {stage.address for stage in stages} | {stage.name for stage in stages}
+    names, addresses = {stage.name for stage in stages}, {stage.address for stage in stages}
     for target in targets:
-        if target not in known:
-            raise UserError("no such stage", where=target, fix=did_you_mean(target, known))
+        if target not in names | addresses:
+            raise UserError(
+                "no such stage", where=target, fix=did_you_mean(target, addresses if "@" in target else names)
+            )
     before = find_predecessors(stages)
     wanted: set[str] = set()
     left = [stage.address for stage in stages if {stage.address, stage.name} & set(targets)]

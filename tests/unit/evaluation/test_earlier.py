@@ -60,3 +60,5 @@ def test_damage_to_any_older_region_shows() -> None:
 
 def test_a_view_without_a_camera_takes_no_part() -> None:
     assert measured((True, True, False, True), damaged=2)["psnr_earlier_inserted_db"] is None
+    after = measured((False, True, True, True), damaged=2)
+    assert after["psnr_earlier_inserted_db"] == measured(damaged=2)["psnr_earlier_inserted_db"], "those after it do"
