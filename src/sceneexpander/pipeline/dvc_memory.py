@@ -89,7 +89,8 @@ def split_lock(path: Path) -> dict[str, str] | None:
     head, *parts = _STAGE_LINE.split(text.removeprefix(LOCK_HEAD))
     if head or any(line[:1] != " " for line in text.removeprefix(LOCK_HEAD).splitlines()):
         return None
-    return {part.partition(":\n")[0]: f"  {part}" for part in parts}
+    named = {part.partition(":\n")[0]: f"  {part}" for part in parts}
+    return named if len(named) == len(parts) else None
 
 
 _NOTHING = object()
