@@ -172,3 +172,13 @@ def test_stopping_early_reports_the_steps_saved_and_looks_once_more() -> None:
     assert len(result.records) == 2
     assert result.steps_saved == 7
     assert [look.step for look in result.looks] == [0, 2]
+
+
+def test_a_low_rank_change_starts_at_nothing_with_directions_to_all_sides() -> None:
+    """As a linear layer's own weights are drawn: evenly within one over the root of its inputs, around zero."""
+    layer = LowRankLinear(torch.nn.Linear(400, 7), 50, torch.Generator().manual_seed(0))
+    assert not layer.lora_b.any()
+    bound = 400**-0.5
+    assert float(layer.lora_a.abs().max()) <= bound
+    assert abs(float(layer.lora_a.mean())) < 0.02 * bound  # 20,000 draws: four standard deviations are 0.016
+    assert float(layer.lora_a.std()) == pytest.approx(bound / 3**0.5, rel=0.03)
