@@ -1,7 +1,8 @@
-"""All that is used of DVC's Python code, private functions included.
+"""All that is used of DVC's Python code, private functions included, but for what `dvc_memory` makes it remember.
 
-DVC is pinned in the lock; ``test_dvc_adapter.py`` and ``test_forkserver.py`` in ``tests/unit/pipeline`` state what each of these has
-to do, so that another version can be judged by two test files. Everything else speaks to DVC through its files and its command line.
+DVC is pinned in the lock; ``test_dvc_adapter.py``, ``test_dvc_memory.py`` and ``test_forkserver.py`` in ``tests/unit/pipeline`` state what
+each of these has to do, so that another version can be judged by three test files.
+Everything else speaks to DVC through its files and its command line.
 """
 
 from __future__ import annotations

@@ -37,10 +37,12 @@ class Memory:
         self._folders: dict[str, list[Any]] = {}
         self._met: set[str] = set()
         self._changed = False
-        with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        with contextlib.suppress(OSError, ValueError, TypeError, KeyError, RecursionError):
             known = json.loads(path.read_text(encoding="utf-8"))
             if known["form"] == _FORM:
-                self._stages, self._folders = dict(known["stages"]), dict(known["folders"])
+                stages, folders = dict(known["stages"]), dict(known["folders"])
+                self._stages = {key: stage for key, stage in stages.items() if isinstance(stage, dict)}
+                self._folders = {key: one for key, one in folders.items() if isinstance(one, list) and len(one) == 4}
 
     def save(self) -> None:
         """Write what is new, without stages that no lock had since this was read. Where nothing can be written nothing is remembered."""
@@ -75,7 +77,7 @@ class Memory:
         return (tuple(known[1:]) if look and known is not None and known[0] == look else None), look
 
     def keep_folder(self, path: str, look: str, value: str, size: int, files: int) -> None:
-        """Remember what `find_folder` did not know, if it still looks as it did."""
+        """Remember the hash, bytes and number of files that belong to a look of `find_folder`."""
         self._folders[path], self._changed = [look, value, size, files], True
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -88,6 +89,15 @@ CHANGES: dict[str, Callable[[Path], Any]] = {
     "what is ignored": edit(".dvcignore", "copy\n"),
     "a damaged memory": edit(str(MEMORY_FILE), '{"form": 1, "stages": [3], "folders": {"a": 7}}'),
 }
+
+
+def test_entries_of_another_shape_are_read_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status_with_memory(capsys)
+    known = json.loads(MEMORY_FILE.read_text())
+    for part in ("stages", "folders"):
+        known[part] = dict.fromkeys(known[part], 7)
+    MEMORY_FILE.write_text(json.dumps(known))
+    assert "up to date" in status_with_memory(capsys)
 
 
 @pytest.mark.parametrize("change", CHANGES)
