@@ -6,10 +6,12 @@ import os
 from collections.abc import Sequence
 
 from sceneexpander.commandline import CommandParser
-from sceneexpander.errors import entry_point
+from sceneexpander.errors import UserError, entry_point
 from sceneexpander.pipeline.declared import read_pipeline, select_stages
 from sceneexpander.pipeline.project import find_project
 from sceneexpander.pipeline.surroundings import pipeline_environment, settle_project
+
+LOCK = "dvc.lock"
 
 
 def make_parser() -> CommandParser:
@@ -31,7 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     from sceneexpander.pipeline import dvc_adapter  # reads where DVC's databases are when it is loaded
 
-    raise SystemExit(dvc_adapter.report_status(chosen))
+    if dvc_adapter.report_status(chosen):
+        fix = f"mend the file that they name; without {LOCK} every stage is looked up in the cache anew"
+        raise UserError("DVC cannot tell what would run; the lines above say why", where=project, fix=fix)
 
 
 if __name__ == "__main__":

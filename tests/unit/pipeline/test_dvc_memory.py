@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -153,3 +155,17 @@ def test_only_looking_writes_no_locks_of_stages(folder: Path, capsys: pytest.Cap
     )
     assert "up to date" in status_with_memory(capsys)
     (folder / ".dvc" / "tmp" / "rwlock").write_text(before)
+
+
+def test_a_lock_left_by_a_merge_is_said_and_nothing_is_changed(folder: Path) -> None:
+    (folder / "conf").mkdir()
+    (folder / "conf" / "config.yaml").touch()  # which makes it a project
+    lock = "<<<<<<< HEAD\n" + (folder / "dvc.lock").read_text()
+    (folder / "dvc.lock").write_text(lock)
+    environment = {**os.environ, "SCENEEXPANDER_ROOT": str(folder)}
+    command = [sys.executable, "-m", "sceneexpander", "status"]
+    asked = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert asked.returncode == 2
+    assert asked.stderr.splitlines()[-1].startswith(f"error: {folder}: DVC cannot tell what would run")
+    assert "Traceback" not in asked.stderr
+    assert (folder / "dvc.lock").read_text() == lock
