@@ -56,7 +56,8 @@ def make_project(folder: Path, scenes: int, files: int) -> None:
             shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
         else:
             shutil.copy2(source, folder / name)
-    subprocess.run(["dvc", "init", "--no-scm", "-q"], cwd=folder, check=True)
+    quiet = {**os.environ, "DVC_NO_ANALYTICS": "true"}
+    subprocess.run(["dvc", "init", "--no-scm", "-q"], cwd=folder, env=quiet, check=True)
     (folder / ".dvc" / "config").write_text((project / ".dvc" / "config").read_text() + "    no_scm = true\n")
     names = [f"scene_{number:04d}" for number in range(scenes)]
     params = yaml.safe_load((folder / "params.yaml").read_text())

@@ -1,6 +1,6 @@
 """Text-guided 3D scene expansion by test-time adaptation of feed-forward reconstructors."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 import sys
 from pathlib import Path

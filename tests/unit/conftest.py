@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
@@ -28,6 +29,8 @@ ROOMS = (
     "photometric",
     "rendering",
 )
+# DVC would start a process for each of its commands that tries to reach its makers, and leave a file where there is no network.
+os.environ["DVC_NO_ANALYTICS"] = "true"
 install_import_hook([f"sceneexpander.{room}" for room in ROOMS], f"{shapes.__name__}.check_shapes")
 
 

@@ -11,6 +11,7 @@ BEYOND = (
     "no_realign",
     "no_tone",
     "no_trust",
+    "no_free_space",
     "no_close_gaps",
     "corrected",
     "default",

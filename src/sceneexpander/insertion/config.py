@@ -11,6 +11,7 @@ from sceneexpander.errors import UserError, did_you_mean
 from sceneexpander.insertion.camera import Camera
 from sceneexpander.insertion.colour import Colour
 from sceneexpander.insertion.contradiction import Contradiction
+from sceneexpander.insertion.free_space import FreeSpace
 from sceneexpander.insertion.gap_filling import GapFilling
 from sceneexpander.insertion.head import GaussianHead
 from sceneexpander.insertion.protocol import Correction
@@ -30,6 +31,7 @@ class CorrectionsConfig:
     camera: Camera = field(default_factory=Camera)
     colour: Colour = field(default_factory=Colour)
     head: GaussianHead = field(default_factory=GaussianHead)
+    free_space: FreeSpace = field(default_factory=FreeSpace)
     gaps: GapFilling = field(default_factory=GapFilling)
     contradiction: Contradiction = field(default_factory=Contradiction)
     others: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

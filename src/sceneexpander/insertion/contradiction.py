@@ -114,11 +114,15 @@ def filled_by_captured(
     gaussians: Gaussians, cameras: Cameras, generated: Bool[Tensor, "view"]
 ) -> Float[Tensor, "gaussian"]:
     """For every Gaussian of a generated view: how far captured Gaussians alone fill its pixel, seen from that view. 0 for the others."""
-    taken = gaussians.select(~gaussians.generated)
     filled = torch.zeros_like(gaussians.opacities)
     for view in torch.nonzero(generated)[:, 0].tolist():
-        alpha = render(taken, cameras[view]).alpha
+        alpha = captured_alpha(gaussians, cameras[view])
         own = gaussians.source_view == view
         there, found = cameras[view].look_up(gaussians.means[own], alpha[:, None])
         filled[own] = torch.where(found.in_frame[0], there[0, 0], 0.0).clamp(0, 1)
     return filled
+
+
+def captured_alpha(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "camera height width"]:
+    """How opaque captured Gaussians alone are."""
+    return render(gaussians.select(~gaussians.generated), camera).alpha

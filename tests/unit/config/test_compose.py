@@ -168,10 +168,11 @@ def test_the_rows_of_the_papers_table_add_one_component_each() -> None:
     assert rows["self_distill"].restore_interval == 0
     assert rows["self_distill_p1"].insertion_probability == 1
     assert rows["paper"].restore_interval > 0
-    # The default is the last row, four corrections, and steps only where they can repair something.
+    # The default is the last row, five corrections, and steps only where they can repair something.
     assert replace(rows["paper"], spend=Spend.WHERE_MOVED) == typed(composed()).adapt
     around = typed(composed()).corrections
     assert (around.camera.realign, around.colour.match, around.contradiction.fade) == ("choose", True, True)
+    assert around.free_space.clear
     assert (around.gaps.reach, around.head.steps, around.others) == (0.7, 0, {})
     for name, row in rows.items():
         assert methods[name].corrections == CorrectionsConfig()

@@ -1,0 +1,134 @@
+"""Generated Gaussians leave space that the photos look through, and their own picture does not notice.
+
+A photo looks along z at a wall four units away. A generated view stands beside it and looks across, where the photo shows nothing behind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from sceneexpander.artifacts.reconstruction import Reconstruction
+from sceneexpander.geometry.agreement import agreement
+from sceneexpander.geometry.cameras import Cameras
+from sceneexpander.insertion.free_space import leave_free_space
+from sceneexpander.models.pixel_aligned import pixel_aligned
+from sceneexpander.splatting import render
+
+INTRINSICS = torch.tensor([[40.0, 0, 20], [0, 40, 16], [0, 0, 1]])
+HEIGHT, WIDTH = 32, 40
+WALL = 4.0
+
+
+def across(x: float, z: float) -> torch.Tensor:
+    """A camera at (x, 0, z) that looks along +x."""
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    pose[0, 3], pose[2, 3] = x, z
+    return pose
+
+
+def scene(guess: float, pose: torch.Tensor, *, posed: tuple[bool, bool] = (True, True)) -> Reconstruction:
+    """A photo of the wall, and a generated view that takes everything to be ``guess`` away."""
+    generated = torch.tensor([False, True])
+    depths = torch.stack([torch.full((HEIGHT, WIDTH), WALL), torch.full((HEIGHT, WIDTH), guess)])
+    poses = torch.stack([torch.eye(4), pose])
+    confidence = torch.full_like(depths, 10.0)
+    ramp = torch.linspace(0, 1, WIDTH).expand(
+        HEIGHT, WIDTH
+    )  # smooth: which of two neighbours is in front does not show
+    images = torch.stack([ramp, 1 - ramp, ramp / 2]).expand(2, 3, HEIGHT, WIDTH)
+    gaussians = pixel_aligned(
+        images=images,
+        depth=depths,
+        depth_conf=confidence,
+        cameras=Cameras(poses, INTRINSICS.expand(2, 3, 3), HEIGHT, WIDTH),
+        generated=generated,
+    )
+    return Reconstruction(
+        method="m", model="m", weights_sha256="0", view_ids=("a", "b"), generated=generated,
+        posed=torch.tensor(posed), camera_vector=torch.zeros(2, 9), world_from_cam=poses,
+        intrinsics_px=INTRINSICS.expand(2, 3, 3).contiguous(), depth=depths, depth_conf=confidence,
+        normals=torch.zeros(2, HEIGHT, WIDTH, 3), normals_conf=confidence, gaussians=gaussians,
+    )  # fmt: skip
+
+
+def in_free_space(made: Reconstruction) -> torch.Tensor:
+    """Which generated Gaussians stand before what the photo sees."""
+    means = made.gaussians.means[made.gaussians.generated]
+    found = agreement(means, made.depth[:1], made.cameras[0])
+    return (found.weight < 0.5) & (found.conflict < 0)
+
+
+BEFORE_THE_WALL = across(
+    -1.2, 2.0
+)  # looks through the photo's frustum, which is two units wide there, half a unit each side of the wall
+
+
+def test_what_stands_in_free_space_goes_to_its_far_end() -> None:
+    before = scene(1.2, BEFORE_THE_WALL)
+    through = in_free_space(before)
+    assert float(through.float().mean()) > 0.5
+    after = leave_free_space(before)
+    assert not bool(in_free_space(after).any())
+    x, y, z = after.gaussians.means[after.gaussians.generated][through].unbind(-1)
+    # 1 on the edge of the photo's picture. Steps are 2 % of a distance of up to four times its half width; some land on the wall before.
+    edge = torch.maximum(x.abs() / (z * 20 / 40), y.abs() / (z * 16 / 40))
+    on_wall = (z / WALL).log().abs() < 0.05
+    assert float((~on_wall).float().mean()) > 0.5
+    assert float(edge[~on_wall].min()) >= 1
+    assert float(edge[~on_wall].max()) < 1.08
+
+
+def test_its_own_view_shows_it_as_before_and_the_depth_goes_along() -> None:
+    before = scene(1.2, BEFORE_THE_WALL)
+    after = leave_free_space(before)
+    shown = [render(one.gaussians.select(one.gaussians.generated), one.cameras[1]) for one in (before, after)]
+    assert torch.allclose(shown[0].rgb, shown[1].rgb, atol=0.05)
+    factor = after.depth[1] / before.depth[1]
+    assert torch.allclose(shown[1].depth[0] / shown[0].depth[0], factor, rtol=0.1)
+    assert float(factor.min()) >= 1
+    assert 1.1 < float(factor.max()) < 2.5
+    points = after.cameras[1].unproject(after.depth[1:]).reshape(-1, 3)
+    assert torch.allclose(points, after.gaussians.means[after.gaussians.generated], atol=1e-4)
+
+
+def test_nothing_else_changes() -> None:
+    before = scene(1.2, BEFORE_THE_WALL)
+    after = leave_free_space(before)
+    own = after.gaussians.generated
+    for field in fields(before.gaussians):
+        a, b = getattr(before.gaussians, field.name), getattr(after.gaussians, field.name)
+        if field.name in ("means", "scales"):
+            assert torch.equal(a[~own], b[~own])
+            stayed = ~in_free_space(before)
+            assert torch.equal(a[own][stayed], b[own][stayed])
+        else:
+            assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+    assert torch.equal(before.depth[0], after.depth[0])
+
+
+@pytest.mark.parametrize(
+    "untouched",
+    [
+        pytest.param(scene(1.2, torch.eye(4)), id="photos fill its pixels from behind"),
+        pytest.param(scene(5.0, BEFORE_THE_WALL), id="it is out of the photo's sight"),
+        pytest.param(scene(1.2, BEFORE_THE_WALL, posed=(True, False)), id="it has no camera"),
+        pytest.param(scene(1.2, BEFORE_THE_WALL, posed=(False, True)), id="no photo has a camera"),
+    ],
+)
+def test_what_nothing_contradicts_or_something_fills_stays(untouched: Reconstruction) -> None:
+    after = leave_free_space(untouched)
+    torch.testing.assert_close(after.gaussians.means, untouched.gaussians.means, rtol=0, atol=0)
+    assert torch.equal(after.depth, untouched.depth)
+
+
+def test_what_is_in_free_space_all_the_way_stays() -> None:
+    """A photo of far mountains sees through everything that a view between it and them shows."""
+    before = scene(1.0, torch.eye(4))
+    far = replace(before, depth=torch.stack([torch.full((HEIGHT, WIDTH), 1e4), before.depth[1]]))
+    far = replace(far, gaussians=far.gaussians.select(far.gaussians.generated))
+    assert bool(in_free_space(far).all())
+    assert torch.equal(leave_free_space(far).gaussians.means, far.gaussians.means)
