@@ -49,7 +49,7 @@ from sceneexpander.pipeline.locks import run_lock
 from sceneexpander.pipeline.preflight import check_scene
 from sceneexpander.pipeline.processes import ended_by_signals
 from sceneexpander.pipeline.project import find_project
-from sceneexpander.pipeline.selection import MOST_ROUNDS, PARAMS, Selection, check_name, read_selection
+from sceneexpander.pipeline.selection import MOST_ROUNDS, PARAMS, Selection, check_methods, check_name, read_selection
 from sceneexpander.pipeline.workspace import make_workspace, merged_overrides, reproduce
 from sceneexpander.plainfiles import require_plain_file
 from sceneexpander.report.cameras import camera_lines
@@ -67,6 +67,7 @@ class Request:
     motions: tuple[str, ...] = ()
     objects: tuple[str, ...] = ()
     name: str | None = None
+    methods: tuple[str, ...] = ()  # empty: those of params.yaml
     overrides: tuple[str, ...] = ()
     unattended: bool = False  # requests that cost something are sent without asking
     dry_run: bool = False
@@ -102,6 +103,9 @@ def make_parser() -> CommandParser:
     parser.add_argument("--yes", action="store_true", help="send requests that cost something without asking")
     parser.add_argument("--dry-run", action="store_true", help="print what would be asked for, and stop")
     parser.add_argument("--name", help="name of the run (default: the folder's)")
+    parser.add_argument(
+        "--methods", metavar="NAME,...", help="rows of its tables, e.g. captured,sceneexpander (default: params.yaml's)"
+    )
     parser.add_argument("--continue", dest="continued", metavar="NAME", help="add a round to this finished run")
     parser.add_argument("--undo", action="store_true", help="with --continue: take its last round away")
     parser.add_argument("--propose", action="store_true", help="with --continue: print motions that show something new")
@@ -138,6 +142,8 @@ def read_arguments(arguments: Sequence[str]) -> argparse.Namespace:
         raise UserError("a run goes on with its own photos and settings", where=str(given.photos), fix="leave it out")
     if given.name is not None:
         raise UserError("is the name of a new run", where="--name", fix="--as names what goes another way")
+    if given.methods is not None:
+        raise UserError("a run goes on with its own methods", where="--methods", fix="leave it out")
     words = {"--inserted": given.inserted, "--prompt": given.prompt, "--motion": given.motion, "--object": given.object}
     for option, values in words.items():
         if len(values) > 1:
@@ -178,6 +184,7 @@ def request_of(given: argparse.Namespace) -> Request:
         motions=tuple(given.motion),
         objects=tuple(given.object),
         name=given.name,
+        methods=() if given.methods is None else check_methods(given.methods.split(","), where="--methods"),
         overrides=(*_settings(given), *given.overrides),
         unattended=given.yes,
         dry_run=given.dry_run,
@@ -348,6 +355,7 @@ def expand(request: Request, *, project: Path) -> Path | None:
     name = run_name(request)
     folder = project / "runs" / name
     base = read_selection(project)
+    methods = request.methods or base.methods
     overrides = merged_overrides(base.overrides, request.overrides, project=project)
     config = parse_dataclass(ProjectConfig, compose(project / "conf", overrides))
     recorded = backend_of(config.generator).takes_recorded
@@ -365,12 +373,12 @@ def expand(request: Request, *, project: Path) -> Path | None:
                     source = replace(request, photos=unpack_archive(request.photos, scratch / UNPACKED))
                 with shown_as_given(_originals(scene, source)):
                     stage_scene(source, name, scene, ingest=config.scene, recorded=recorded)
-                    checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=base.methods)
+                    checked = check_scene(name, scene, conf=project / "conf", overrides=overrides, methods=methods)
             announce_forecasts(checked.forecasts, config.generator.backend, details=request.dry_run)
             if request.dry_run:
                 return None
             agree_to_requests(checked.forecasts, unattended=request.unattended)
-            selection = Selection(scenes=(name,), rounds=checked.rounds, methods=base.methods, overrides=overrides)
+            selection = Selection(scenes=(name,), rounds=checked.rounds, methods=methods, overrides=overrides)
             folder.mkdir(exist_ok=True)
             facts = {"photos": os.fsdecode(_identity(request)), "name": name, "rounds": checked.rounds}
             write_bytes_atomic(folder / SOURCE_FILE, f"{json.dumps(facts, indent=1)}\n".encode())

@@ -131,9 +131,9 @@ python scripts/real_ablation.py FOLDER ... --rows paper,default                 
 ```
 
 *What rows hold.* `captured`: the scene before the insertion. `baseline`: the same weights given the inserted view like a photo.
-`corrected`: what SceneExpander changes without a step of adaptation (the inserted picture's colours, cameras, fading, closed gaps, a
-doubting fit). `default`: the same with Algorithm 1, nothing left out. `paper`: the paper's method, Algorithm 1 without the corrections;
-the rows before it in the paper's table have fewer of its components. `no_...`: the default without one correction.
+`corrected`: what SceneExpander changes without a step of adaptation (the inserted picture's colours, cameras, fading, free space, closed
+gaps, a doubting fit). `default`: the same with Algorithm 1, nothing left out. `paper`: the paper's method, Algorithm 1 without the
+corrections; the rows before it in the paper's table have fewer of its components. `no_...`: the default without one correction.
 `control_...`: see `conf/ablation/`.
 
 *How they are compared.* Rows of one scene, grade and seed differ in nothing but the row: the same estimate of the front-end, the same seed

@@ -6,7 +6,7 @@ Scenes and rounds become names of folders and words of commands, so only plain o
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,7 @@ def read_selection(project: Path) -> Selection:
         rounds=len(rounds),
         previous=_previous(rounds, f"{path}: rounds"),
         round_overrides=_round_overrides(rounds, f"{path}: rounds"),
-        methods=_methods(_list(raw, "methods", path), f"{path}: methods"),
+        methods=check_methods(_list(raw, "methods", path), where=f"{path}: methods"),
         overrides=_texts(_list(raw, "overrides", path, may_be_empty=True), f"{path}: overrides", "adapt.steps=5"),
     )
 
@@ -103,6 +103,17 @@ def check_name(name: str, *, where: str | Path, fix: str) -> None:
         raise UserError(f"{name!r} is a name that the pipeline uses for its own results", where=where, fix=fix)
 
 
+def check_methods(items: Sequence[Any], *, where: str) -> tuple[str, ...]:
+    """The names of methods: all of them known, none twice, and none without what it starts from. Raises `UserError`."""
+    methods = _texts(items, where, "sceneexpander")
+    for method in [method_named(name, where=where) for name in methods]:
+        start = None if method.starts_from is None else method_named(method.starts_from)
+        if start is not None and not start.always_made and start.name not in methods:
+            problem, fix = f"{method.name!r} starts from {start.name!r}", f"list {start.name} too"
+            raise UserError(problem, where=where, fix=fix)
+    return _distinct(methods, where)
+
+
 def _list(raw: Mapping[str, Any], key: str, path: Path, *, may_be_empty: bool = False) -> list[Any]:
     value = raw[key]
     if not isinstance(value, list):
@@ -112,7 +123,7 @@ def _list(raw: Mapping[str, Any], key: str, path: Path, *, may_be_empty: bool = 
     return value
 
 
-def _texts(items: list[Any], where: str, example: str) -> tuple[str, ...]:
+def _texts(items: Sequence[Any], where: str, example: str) -> tuple[str, ...]:
     for item in items:
         if not isinstance(item, str):
             raise UserError(f"holds {_shown(item)}, expected a list of texts such as {example}", where=where)
@@ -131,17 +142,6 @@ def _scenes(items: list[Any], where: str) -> tuple[str, ...]:
     for name in names:
         check_name(name, where=where, fix="name a folder of scenes/")
     return _distinct(names, where)
-
-
-def _methods(items: list[Any], where: str) -> tuple[str, ...]:
-    """All of them known, and none without what it starts from."""
-    methods = _texts(items, where, "sceneexpander")
-    for method in [method_named(name, where=where) for name in methods]:
-        start = None if method.starts_from is None else method_named(method.starts_from)
-        if start is not None and not start.always_made and start.name not in methods:
-            problem, fix = f"{method.name!r} starts from {start.name!r}", f"list {start.name} too"
-            raise UserError(problem, where=where, fix=fix)
-    return _distinct(methods, where)
 
 
 def _previous(items: list[Any], where: str) -> tuple[int, ...]:

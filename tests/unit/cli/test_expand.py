@@ -371,6 +371,37 @@ def test_a_run_has_the_projects_methods_and_settings(
     assert checked[0]["methods"] == selection.methods
 
 
+def test_a_run_may_have_methods_of_its_own(project: Path, tmp_path: Path) -> None:
+    given = ["--prompt", "A bench.", "--inserted", str(picture(tmp_path / "bench.png", 150))]
+    asked = command.parse_arguments([str(photos(tmp_path / "photos")), *given, "--methods", "captured,sceneexpander"])
+    expand(asked, project=project)
+    assert read_selection(project / "runs" / "photos").methods == ("captured", "sceneexpander")
+    expand(replace(asked, methods=()), project=project)
+    assert read_selection(project / "runs" / "photos").methods == read_selection(project).methods
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ["photos", "--methods", "captured,sceneexpandr"],
+            "--methods: unknown 'sceneexpandr'; did you mean 'sceneexpander'?",
+        ),
+        (["photos", "--methods", ""], "--methods: unknown ''"),
+        (["photos", "--methods", "captured,captured"], "--methods: names 'captured' twice"),
+        (
+            ["photos", "--methods", "ttt3r_optimised"],
+            "--methods: 'ttt3r_optimised' starts from 'ttt3r'; list ttt3r too",
+        ),
+        (["--continue", "a", "--methods", "captured"], "--methods: a run goes on with its own methods; leave it out"),
+    ],
+)
+def test_methods_that_cannot_be_are_one_line(arguments: list[str], line: str) -> None:
+    with pytest.raises(UserError) as caught:
+        command.parse_arguments(arguments)
+    assert caught.value.line().startswith(line)
+
+
 def test_a_picture_named_twice_is_refused(project: Path, tmp_path: Path) -> None:
     """The project's own picture must not stand in for the one that was given."""
     params = project / "params.yaml"
