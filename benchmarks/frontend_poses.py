@@ -437,7 +437,7 @@ def main() -> None:
     parser.add_argument("--no-learned", action="store_true", help="without learned keypoints: three times as fast")
     parser.add_argument("--known", action="store_true", help="--cases with the true lenses given")
     parser.add_argument("--verbose", action="store_true", help="--cases with a line per view")
-    arguments = parser.parse_args()
+    arguments = parser.parse_intermixed_args()
     torch.set_num_threads(1)
     config = SfmConfig(learned=LearnedUse.NEVER) if arguments.no_learned else SfmConfig()
     if arguments.cases:

@@ -47,7 +47,7 @@ def main() -> None:
     """Time and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--views", type=int, nargs="+", default=[2, 4, 8])
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(0)
     omnivggt = OmniVGGT.create(

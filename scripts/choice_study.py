@@ -239,7 +239,7 @@ def main() -> None:
     parser.add_argument("--edits", default=EDITS, help="that make a folder's candidates; exposure_6 is another one")
     parser.add_argument("--shrink", type=int, default=1, help="scenes have that many times fewer pixels per side")
     parser.add_argument("--out", type=Path, required=True, help="results, continued if they are there")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     overrides = [word for word in options.cases if "=" in word]
     cases = [word for word in options.cases if "=" not in word]
     config = parse_dataclass(ProjectConfig, compose(find_project() / "conf", ["experiment=expandbench", *overrides]))

@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("--grades", default=GRADES)
     parser.add_argument("--cache", type=Path, required=True, help="prepared scenes, reused")
     parser.add_argument("overrides", nargs="*", metavar="key=value")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     config = parse_dataclass(
         ProjectConfig, compose(find_project() / "conf", ["experiment=expandbench", *options.overrides])
     )

@@ -257,7 +257,7 @@ def main() -> None:
     parser.add_argument("--view", type=int, default=0, help="number of the captured view")
     parser.add_argument("--times", type=int, nargs="+", default=[2, 4], help="of the stored size")
     parser.add_argument("--pictures", type=Path, help="folder for what the programs drew")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     if options.pictures is not None:
         options.pictures.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp())

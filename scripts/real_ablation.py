@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--set", default=[], action="append", metavar="KEY=VALUE", help="configuration override")
     parser.add_argument("--out", type=Path, help="folder for pictures")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     rows = [row for row in options.rows.split(",") if row]
     for folder in options.folders:
         run(folder, rows, options.set, [int(seed) for seed in options.seeds.split(",")], options.out)

@@ -119,7 +119,7 @@ def main() -> None:
     parser.add_argument("--hold-out", nargs="*", metavar="PHOTO", help="names of photos; default: each in turn")
     parser.add_argument("--optimise", action="store_true", help="3DGS too")
     parser.add_argument("--set", default=[], action="append", metavar="KEY=VALUE", help="configuration override")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     config = parse_dataclass(ProjectConfig, compose(find_project() / "conf", options.set))
     for folder in options.folders:
         check(folder, config, options.hold_out, with_3dgs=options.optimise)

@@ -123,7 +123,7 @@ def main() -> None:
     parser.add_argument("--shrink", type=int, default=1, help="scenes have that many times fewer pixels per side")
     parser.add_argument("--cache", type=Path, required=True, help="prepared scenes, reused")
     parser.add_argument("--out", type=Path, required=True, help="results, continued if they are there")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     overrides = [word for word in options.scenes if "=" in word]
     config = parse_dataclass(ProjectConfig, compose(find_project() / "conf", ["experiment=expandbench", *overrides]))
     torch.set_num_threads(config.threads or 1)

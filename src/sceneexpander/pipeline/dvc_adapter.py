@@ -42,7 +42,7 @@ def report_status(arguments: Sequence[str]) -> int:
     from dvc.cli import main
 
     _take_any_path()
-    with _remembering(), _without_stage_locks():
+    with _remembering(still=True), _without_stage_locks():
         return int(main(["status", *arguments]))
 
 
@@ -121,9 +121,11 @@ def _without_stage_locks() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _remembering() -> Iterator[None]:
+def _remembering(*, still: bool = False) -> Iterator[None]:
     ignored = Path(".dvcignore")
-    with remembering(Memory(MEMORY_FILE), ignored.read_text(encoding="utf-8") if ignored.is_file() else ""):
+    with remembering(
+        Memory(MEMORY_FILE, still=still), ignored.read_text(encoding="utf-8") if ignored.is_file() else ""
+    ):
         yield
 
 

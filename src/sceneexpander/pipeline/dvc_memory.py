@@ -31,8 +31,11 @@ _FORM = 1  # of the memory's file
 class Memory:
     """What is known of one pipeline folder. Nothing in it is needed: what is not known, or of another form, is read."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, still: bool = False) -> None:
+        """``still``: no folder changes while this is used, so each is looked at once, however many stages make or read it."""
         self._path = path
+        self._still = still
+        self._looks: dict[str, str] = {}
         self._stages: dict[str, Any] = {}
         self._folders: dict[str, list[Any]] = {}
         self._met: set[str] = set()
@@ -72,7 +75,9 @@ class Memory:
 
         ``ignored``: the rules for files that do not count. A look is empty for what cannot be told by it.
         """
-        look = _look_at(path, ignored)
+        look = self._looks.get(path) if self._still else None
+        if look is None:
+            look = self._looks[path] = _look_at(path, ignored)
         known = self._folders.get(path)
         return (tuple(known[1:]) if look and known is not None and known[0] == look else None), look
 

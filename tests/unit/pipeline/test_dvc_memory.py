@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from sceneexpander.pipeline import dvc_adapter
+from sceneexpander.pipeline import dvc_adapter, dvc_memory
 from sceneexpander.pipeline.dvc_memory import MEMORY_FILE
 
 STAGES = """
@@ -136,6 +136,18 @@ def test_what_is_remembered_is_not_read_again(
     assert {Path(path).name for path in built if Path(path).is_dir()} <= {"one", "made"}
     assert all("make@y" not in text for text in parsed)
     assert dvcfile.Lockfile._load_yaml is original
+
+
+def test_where_nothing_changes_a_folder_is_looked_at_once(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many stages make or read it."""
+    looked: list[str] = []
+    look = dvc_memory._look_at
+    monkeypatch.setattr(dvc_memory, "_look_at", lambda path, ignored: looked.append(path) or look(path, ignored))
+    status_with_memory(capsys)
+    assert looked
+    assert len(looked) == len(set(looked))
 
 
 def test_a_link_to_a_folder_counts_as_it_does_for_dvc(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
