@@ -23,6 +23,7 @@ from sceneexpander.insertion.protocol import RoundContext, RoundInputs
 _STEP = SAME_SURFACE / 2  # of the logarithm of the distance
 _FARTHEST = 16.0  # of its distance: what is in free space up to there stays
 _FREE = 0.5  # agreement with the photos below which a point in front of what they see stands in free space
+_MARGIN = 0.04  # of a photo's longer side: so far beyond its edge it is taken to see what it sees at the edge
 _FILLED = 0.5  # alpha of captured Gaussians from which on they show a pixel
 
 
@@ -50,7 +51,7 @@ def leave_free_space(reconstruction: Reconstruction) -> Reconstruction:
     views = torch.nonzero(generated & reconstruction.posed)[:, 0].tolist()
     if not views or not bool(captured.any()):
         return reconstruction
-    seen, seen_from = reconstruction.depth[captured], cameras[captured]
+    seen, seen_from = _with_margin(reconstruction.depth[captured], cameras[captured])
     gaussians, depth = reconstruction.gaussians, reconstruction.depth.clone()
     means, scales = gaussians.means.clone(), gaussians.scales.clone()
     for view in views:
@@ -65,6 +66,20 @@ def leave_free_space(reconstruction: Reconstruction) -> Reconstruction:
         points = camera.unproject(depth[view : view + 1]).reshape(-1, 3)
         depth[view] *= _to_free_end(points, centre, alpha.flatten(), seen, seen_from).view_as(depth[view])
     return replace(reconstruction, depth=depth, gaussians=replace(gaussians, means=means, scales=scales))
+
+
+def _with_margin(
+    depth: Float[Tensor, "view height width"], cameras: Cameras
+) -> tuple[Float[Tensor, "view height_and_margins width_and_margins"], Cameras]:
+    """Depth maps continued beyond their edges, and their cameras.
+
+    A Gaussian has a size: with its mean just outside of a photo it would reach into the picture, before all that is seen there.
+    """
+    margin = round(_MARGIN * max(depth.shape[1:]))
+    wider = torch.nn.functional.pad(depth[:, None], (margin,) * 4, mode="replicate")[:, 0]
+    intrinsics = cameras.intrinsics_px.clone()
+    intrinsics[:, :2, 2] += margin
+    return wider, Cameras(cameras.world_from_cam, intrinsics, *wider.shape[1:])
 
 
 def _to_free_end(
