@@ -42,9 +42,10 @@ class FreeSpace:
 def leave_free_space(reconstruction: Reconstruction) -> Reconstruction:
     """The same reconstruction, its generated Gaussians in free space moved away from their own view's camera, as far as they have to be.
 
-    Moved is what stands in front of what a captured view sees there, and lies in a pixel of its own view that captured Gaussians do not
-    fill: elsewhere they show what is behind it. A Gaussian goes along its ray to the first place that no captured view contradicts, and
-    grows with its distance, so that its own view shows it as before. The view's depth goes with it. Views without a camera stay.
+    Moved is what stands in front of what a captured view sees there, or at its edge if it is right beside, and lies in a pixel of its own
+    view that captured Gaussians do not fill: elsewhere they show what is behind it. A Gaussian goes along its ray to the first place that
+    no captured view contradicts, and grows with its distance, so that its own view shows it as before. The view's depth goes with it.
+    Views without a camera stay.
     """
     cameras, generated = reconstruction.cameras, reconstruction.generated
     captured = ~generated & reconstruction.posed
@@ -58,9 +59,8 @@ def leave_free_space(reconstruction: Reconstruction) -> Reconstruction:
         camera, centre = cameras[view], cameras.centres[view]
         alpha = captured_alpha(gaussians, camera)
         own = torch.nonzero(gaussians.source_view == view)[:, 0]
-        there, found = camera.look_up(means[own], alpha[:, None])
-        filled = torch.where(found.in_frame[0], there[0, 0], 1.0)  # out of its own picture there is nothing to keep
-        factors = _to_free_end(means[own], centre, filled, seen, seen_from)
+        there, _ = camera.look_up(means[own], alpha[:, None])
+        factors = _to_free_end(means[own], centre, there[0, 0], seen, seen_from)
         means[own] = centre + (means[own] - centre) * factors[:, None]
         scales[own] *= factors[:, None]
         points = camera.unproject(depth[view : view + 1]).reshape(-1, 3)

@@ -75,9 +75,9 @@ class Memory:
 
         ``ignored``: the rules for files that do not count. A look is empty for what cannot be told by it.
         """
-        look = self._looks.get(path) if self._still else None
-        if look is None:
-            look = self._looks[path] = _look_at(path, ignored)
+        look = self._looks[path] if path in self._looks else _look_at(path, ignored)
+        if self._still:
+            self._looks[path] = look
         known = self._folders.get(path)
         return (tuple(known[1:]) if look and known is not None and known[0] == look else None), look
 

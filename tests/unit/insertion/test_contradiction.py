@@ -12,11 +12,8 @@ from sceneexpander.geometry.agreement import Agreement, agreement
 from sceneexpander.geometry.camera import unproject_to_world
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.insertion.contradiction import LOST, fade_contradicted, pixel_trust
-from sceneexpander.models.pixel_aligned import pixel_aligned
 from sceneexpander.models.protocol import Prediction
-
-INTRINSICS = torch.tensor([[40.0, 0, 20], [0, 40, 16], [0, 0, 1]])
-HEIGHT, WIDTH = 32, 40
+from tests.worlds.two_views import HEIGHT, INTRINSICS, WIDTH, photo_and_generated
 
 
 def setup(factor: float, shift: float = 0.0) -> tuple[torch.Tensor, ...]:
@@ -79,25 +76,9 @@ def scene_of_two(factor: float, colour: float) -> tuple[Reconstruction, torch.Te
     images[1] = colour
     depth = torch.full((2, HEIGHT, WIDTH), 2.0)
     depth[1] *= factor
-    poses, intrinsics = torch.eye(4).expand(2, 4, 4).clone(), INTRINSICS.expand(2, 3, 3).clone()
     normals = torch.zeros(2, HEIGHT, WIDTH, 3)
     normals[..., 2] = -1
-    generated = torch.tensor([False, True])
-    gaussians = pixel_aligned(
-        images=images,
-        depth=depth,
-        depth_conf=torch.full_like(depth, 10.0),
-        cameras=Cameras(poses, intrinsics, *depth.shape[1:]),
-        normals=normals,
-        generated=generated,
-    )
-    made = Reconstruction(
-        method="m", model="m", weights_sha256="0", view_ids=("a", "b"), generated=generated,
-        posed=torch.ones(2, dtype=torch.bool), camera_vector=torch.zeros(2, 9), world_from_cam=poses,
-        intrinsics_px=intrinsics, depth=depth, depth_conf=torch.ones_like(depth), normals=normals,
-        normals_conf=torch.ones_like(depth), gaussians=gaussians,
-    )  # fmt: skip
-    return made, images
+    return photo_and_generated(images, depth, torch.eye(4).repeat(2, 1, 1), normals=normals), images
 
 
 def kept(factor: float, colour: float) -> torch.Tensor:

@@ -12,11 +12,9 @@ from sceneexpander.geometry.camera import pixel_centres
 from sceneexpander.geometry.cameras import Cameras
 from sceneexpander.geometry.rigid import rotation_from_quat_wxyz
 from sceneexpander.insertion.gap_filling import close_gaps
-from sceneexpander.models.pixel_aligned import pixel_aligned
 from sceneexpander.splatting import render
+from tests.worlds.two_views import HEIGHT, INTRINSICS, WIDTH, photo_and_generated
 
-INTRINSICS = torch.tensor([[40.0, 0, 20], [0, 40, 16], [0, 0, 1]])
-HEIGHT, WIDTH = 32, 40
 AWAY = torch.eye(4)  # the captured camera looks the other way and sees nothing of the floor
 AWAY[0, 0] = AWAY[2, 2] = -1.0
 # Two units above the floor, four ahead of the generated view, looking straight down.
@@ -38,22 +36,12 @@ def wall(step: float) -> torch.Tensor:
 
 def scene(depth: torch.Tensor, captured_pose: torch.Tensor = AWAY, *, posed: bool = True) -> Reconstruction:
     """A captured view (grey, the same depth map) and a generated one at the origin."""
-    generated = torch.tensor([False, True])
-    depths, poses = torch.stack([depth, depth]), torch.stack([captured_pose, torch.eye(4)])
-    confidence = torch.full_like(depths, 10.0)
-    gaussians = pixel_aligned(
-        images=torch.full((2, 3, HEIGHT, WIDTH), 0.5),
-        depth=depths,
-        depth_conf=confidence,
-        cameras=Cameras(poses, INTRINSICS.expand(2, 3, 3), HEIGHT, WIDTH),
-        generated=generated,
+    return photo_and_generated(
+        torch.full((2, 3, HEIGHT, WIDTH), 0.5),
+        torch.stack([depth, depth]),
+        torch.stack([captured_pose, torch.eye(4)]),
+        posed=(True, posed),
     )
-    return Reconstruction(
-        method="m", model="m", weights_sha256="0", view_ids=("a", "b"), generated=generated,
-        posed=torch.tensor([True, posed]), camera_vector=torch.zeros(2, 9), world_from_cam=poses,
-        intrinsics_px=INTRINSICS.expand(2, 3, 3).contiguous(), depth=depths, depth_conf=confidence,
-        normals=torch.zeros(2, HEIGHT, WIDTH, 3), normals_conf=confidence, gaussians=gaussians,
-    )  # fmt: skip
 
 
 def covariances(reconstruction: Reconstruction) -> torch.Tensor:
